@@ -1,0 +1,54 @@
+"""The project's exceptions: each names the thing, what was expected, what was found, and what to do next."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class MPCOfflineError(Exception):
+    """Base class of the errors raised on purpose by mpcoffline.
+
+    Args:
+        name: What is wrong, as the user knows it (an argument, a file, a dataset id).
+        expected: What would have been right.
+        actual: What was found.
+        hint: What to do next.
+    """
+
+    def __init__(self, name: str, *, expected: str, actual: str, hint: str = "") -> None:
+        self.name, self.expected, self.actual, self.hint = name, expected, actual, hint
+        message = f"{name}: expected {expected}, got {actual}."
+        super().__init__(f"{message} {hint}".rstrip())
+
+
+class InvalidArgumentError(MPCOfflineError, ValueError):
+    """An argument has the wrong shape, range, type or unit."""
+
+
+class InvalidDataError(MPCOfflineError, ValueError):
+    """A data set holds something that must not be learned from (NaN, wrong spaces, actions out of bounds)."""
+
+
+class UnknownIdError(MPCOfflineError, LookupError):
+    """An environment, data set, solver or preset of this name does not exist."""
+
+    @classmethod
+    def of(cls, kind: str, given: str, known: Iterable[str], hint: str = "") -> UnknownIdError:
+        """Builds the error with the nearest known names first.
+
+        Args:
+            kind: What the name stands for, e.g. ``"dataset id"``.
+            given: The unknown name.
+            known: All names that would have been right.
+            hint: What to do next; by default the nearest names are proposed.
+        """
+        names = sorted(known)
+        nearest = difflib.get_close_matches(given, names, n=3, cutoff=0.4)
+        if not hint and nearest:
+            hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}?"
+        return cls(kind, expected=f"one of {', '.join(names) or '(none)'}", actual=repr(given), hint=hint)
+
+
+class FileFormatError(MPCOfflineError, ValueError):
+    """A file is damaged, is of another kind or another version, or holds what it must not hold."""
