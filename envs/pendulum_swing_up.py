@@ -64,9 +64,7 @@ class PendulumSwingUpEnv(ControlTask):
 
     def derivative(self, state: Array, action: Array) -> Array:
         """The equation of motion: d[phi, phid]/dt, ``(..., 2)``."""
-        acceleration = (
-            1.5 * GRAVITY / LENGTH * np.sin(state[..., 0]) + 3.0 / (MASS * LENGTH**2) * action[..., 0]
-        )
+        acceleration = 1.5 * GRAVITY / LENGTH * np.sin(state[..., 0]) + 3.0 / (MASS * LENGTH**2) * action[..., 0]
         return np.stack([state[..., 1], acceleration], axis=-1)
 
     def next_state(self, state: Array, action: Array) -> Array:

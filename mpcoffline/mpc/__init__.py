@@ -1,0 +1,21 @@
+"""WHAT is optimised: parameters, model, costs and the MPC problem, written in CasADi."""
+
+from __future__ import annotations
+
+from .component import StageCost, TerminalCost
+from .cost import NormCost, QuadraticCost
+from .model import Model
+from .parameters import Block, Parameter, ParameterSpace
+from .problem import MPC
+
+__all__ = [
+    "MPC",
+    "Block",
+    "Model",
+    "NormCost",
+    "Parameter",
+    "ParameterSpace",
+    "QuadraticCost",
+    "StageCost",
+    "TerminalCost",
+]

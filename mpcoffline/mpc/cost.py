@@ -1,0 +1,195 @@
+"""Stage and terminal costs of (MPC): (COST) with an optional cross term, and (TERM)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
+
+from .component import Component, blocks_from_json
+from .parameters import Array, Block, ParameterSpace
+
+
+class QuadraticCost(Component):
+    """The quadratic cost (COST) of arXiv:2301.01667, optionally with a cross term.
+
+    As a stage cost, with e = x - x_ref and v = u - u_ref::
+
+        Lhat(x, u) = e'We + 2 e'Sv + v'Rv + constant,        [[W, S], [S', R]] positive semidefinite
+
+    and as a terminal cost e'We + constant. Without ``S`` the matrices W and R are parameters of their own
+    (the paper's form); with ``S`` the whole matrix H = [[W, S], [S', R]] is one.
+
+    Args:
+        W: State weight, ``(nx, nx)``.
+        R: Input weight, ``(nu, nu)``; without it inputs are free of cost.
+        S: Cross weight, ``(nx, nu)``; needs ``R``.
+        x_ref: State reference, ``(nx,)``; zero by default.
+        u_ref: Input reference, ``(nu,)``; zero by default.
+        constant: The offset theta_3 of (COST).
+
+    Raises:
+        InvalidArgumentError: If shapes do not fit, or the weights are not symmetric positive semidefinite.
+    """
+
+    def __init__(
+        self,
+        W: ArrayLike,
+        R: ArrayLike | None = None,
+        S: ArrayLike | None = None,
+        x_ref: ArrayLike | None = None,
+        u_ref: ArrayLike | None = None,
+        constant: float = 0.0,
+    ) -> None:
+        weight = np.atleast_2d(np.asarray(W, dtype=np.float64))
+        nx = weight.shape[0]
+        blocks: list[Block] = []
+        nu = 0
+        if R is None:
+            if S is not None or u_ref is not None:
+                raise InvalidArgumentError("R", expected="a matrix, as S or u_ref is given", actual="None")
+            blocks.append(Block.psd("W", weight, "cost"))
+        else:
+            input_weight = np.atleast_2d(np.asarray(R, dtype=np.float64))
+            nu = input_weight.shape[0]
+            blocks += _weight_blocks(weight, input_weight, S)
+            blocks.append(Block.free("u_ref", _reference("u_ref", u_ref, nu), "reference"))
+        blocks.append(Block.free("x_ref", _reference("x_ref", x_ref, nx), "reference"))
+        blocks.append(Block.free("constant", float(constant), "cost"))
+        self.nx, self.nu = nx, nu
+        self.space = ParameterSpace(blocks)
+
+    @property
+    def W(self) -> Array:
+        """State weight, ``(nx, nx)``."""
+        return self._weights()[: self.nx, : self.nx]
+
+    @property
+    def R(self) -> Array:
+        """Input weight, ``(nu, nu)``."""
+        return self._weights()[self.nx :, self.nx :]
+
+    @property
+    def S(self) -> Array:
+        """Cross weight, ``(nx, nu)``; zero when it is not a parameter."""
+        return self._weights()[: self.nx, self.nx :]
+
+    def _weights(self) -> Array:
+        """The matrix H ``(nx + nu, nx + nu)``."""
+        values = self.values
+        if "H" in values:
+            return values["H"]
+        H = np.zeros((self.nx + self.nu,) * 2)
+        H[: self.nx, : self.nx] = values["W"]
+        if "R" in values:
+            H[self.nx :, self.nx :] = values["R"]
+        return H
+
+    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that e'We = |C'e|^2."""
+        e = x - p["x_ref"]
+        if "H" in p:
+            return ca.sumsqr(p["H"].T @ ca.vertcat(e, u - p["u_ref"])) + p["constant"]
+        cost = ca.sumsqr(p["W"].T @ e) + p["constant"]
+        if "R" in p:
+            cost += ca.sumsqr(p["R"].T @ (u - p["u_ref"]))
+        return cost
+
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """E'We + constant as a CasADi scalar."""
+        factor = p["W"] if "W" in p else p["H"][: self.nx, :]
+        return ca.sumsqr(factor.T @ (x - p["x_ref"])) + p["constant"]
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> QuadraticCost:
+        """The inverse of :meth:`to_json`."""
+        cost = cls.__new__(cls)
+        cost.space = blocks_from_json(data)
+        values = cost.values
+        cost.nx = len(values["x_ref"])
+        cost.nu = len(values["u_ref"]) if "u_ref" in values else 0
+        return cost
+
+
+class NormCost(Component):
+    """The terminal cost (TERM) of arXiv:2301.01667: the 2-norm of the distance to the reference, not squared.
+
+    The norm has a kink at the reference, at which Newton's method fails; it is smoothed::
+
+        T(x) = sqrt(|x - x_ref|^2 + eps^2) - eps
+
+    which lies at most ``eps`` below the norm and vanishes at the reference.
+
+    Args:
+        x_ref: Reference, ``(nx,)``.
+        eps: Smoothing, in the units of x. Newton solvers get slow below 1e-2; where gamma^N is small, 0.1 is as good.
+
+    Raises:
+        InvalidArgumentError: If ``eps`` is not positive.
+    """
+
+    def __init__(self, x_ref: ArrayLike, eps: float = 0.1) -> None:
+        if not (np.isfinite(eps) and eps > 0.0):
+            raise InvalidArgumentError("eps", expected="a positive number", actual=str(eps))
+        reference = np.atleast_1d(np.asarray(x_ref, dtype=np.float64))
+        self.nx, self.eps = len(reference), float(eps)
+        self.space = ParameterSpace([Block.free("x_ref", reference, "reference")])
+
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """(TERM), smoothed, as a CasADi scalar."""
+        return ca.sqrt(ca.sumsqr(x - p["x_ref"]) + self.eps**2) - self.eps
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description."""
+        return super().to_json() | {"eps": self.eps}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> NormCost:
+        """The inverse of :meth:`to_json`."""
+        cost = cls(np.zeros(1), float(data["eps"]))
+        cost.space = blocks_from_json(data)
+        cost.nx = len(cost.values["x_ref"])
+        return cost
+
+
+_KINDS: dict[str, type[QuadraticCost] | type[NormCost]] = {
+    "QuadraticCost": QuadraticCost,
+    "NormCost": NormCost,
+}
+
+
+def cost_from_json(data: Mapping[str, Any]) -> Any:
+    """A stage or terminal cost from its JSON form.
+
+    Raises:
+        FileFormatError: For an unknown kind of cost.
+    """
+    kind = data.get("kind")
+    if kind not in _KINDS:
+        raise FileFormatError("cost", expected=f"one of {', '.join(_KINDS)}", actual=repr(kind))
+    return _KINDS[kind].from_json(data)
+
+
+def _reference(name: str, given: ArrayLike | None, size: int) -> Array:
+    reference = np.zeros(size) if given is None else np.atleast_1d(np.asarray(given, dtype=np.float64))
+    if reference.shape != (size,):
+        raise InvalidArgumentError(name, expected=f"shape ({size},)", actual=f"shape {reference.shape}")
+    return reference
+
+
+def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:
+    """W and R as blocks of their own, or one block H when there is a cross term."""
+    if S is None:
+        return [Block.psd("W", W, "cost"), Block.psd("R", R, "cost")]
+    cross = np.asarray(S, dtype=np.float64)
+    if cross.shape != (len(W), len(R)):
+        raise InvalidArgumentError("S", expected=f"shape {(len(W), len(R))}", actual=f"shape {cross.shape}")
+    for name, matrix in (("W", W), ("R", R)):
+        if matrix.shape[0] != matrix.shape[1]:
+            raise InvalidArgumentError(name, expected="a square matrix", actual=f"shape {matrix.shape}")
+    return [Block.psd("H", np.block([[W, cross], [cross.T, R]]), "cost")]

@@ -1,0 +1,129 @@
+"""The prediction model x_{k+1} = f_theta(x_k, u_k) of (MPC), written once in CasADi."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mpcoffline.errors import InvalidArgumentError
+
+from .component import Component, blocks_from_json, function_from_text
+from .parameters import Array, Block, Parameter, ParameterSpace
+
+Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
+
+
+class Model(Component):
+    """A model f_theta, from an ordinary differential equation or from a discrete-time map.
+
+    An ODE is integrated with one RK4 step of length ``dt``, the input held.
+
+    Example:
+        >>> def ode(x, u, p):
+        ...     return ca.vertcat(x[1], (u[0] - p["c"] * x[1]) / p["m"])
+        >>> model = Model(ode, nx=2, nu=1, dt=0.05, parameters={"m": Parameter(1.0, low=0.1, unit="kg"), "c": 0.1})
+
+    Args:
+        dynamics: ``(x, u, p) -> dx/dt``, or ``-> x+`` with ``discrete=True``. ``x`` is ``(nx, 1)``, ``u`` is ``(nu, 1)``,
+            ``p`` maps parameter names to CasADi matrices of their shapes.
+        nx: Number of model states (the policy's observation is the model state).
+        nu: Number of inputs.
+        dt: Sampling time in s.
+        parameters: Numbers, arrays or :class:`Parameter`; what learning may change.
+        discrete: Whether ``dynamics`` is already the discrete-time map.
+
+    Raises:
+        InvalidArgumentError: For non-positive sizes or ``dt``, or dynamics that return something of another shape or
+            that CasADi cannot evaluate symbolically.
+    """
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        nx: int,
+        nu: int,
+        dt: float,
+        parameters: Mapping[str, Parameter | ArrayLike] | None = None,
+        *,
+        discrete: bool = False,
+    ) -> None:
+        for name, value in (("nx", nx), ("nu", nu)):
+            if value < 1:
+                raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
+        self.nx, self.nu, self.dt = int(nx), int(nu), float(dt)
+        blocks = [Block.free(name, value, "model") for name, value in (parameters or {}).items()]
+        self.space = ParameterSpace(blocks)
+        self.function = self._discretised(dynamics, discrete)
+
+    def _discretised(self, dynamics: Dynamics, discrete: bool) -> ca.Function:
+        """The map (x, u, p) -> x+ as SX function, p being this model's flat parameter vector."""
+        x, u = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu)
+        theta = ca.SX.sym("p", self.space.size)
+        p = self.space.symbols(theta)
+
+        def f(state: ca.SX) -> ca.SX:
+            value = ca.densify(ca.SX(dynamics(state, u, p)))
+            if value.shape != (self.nx, 1):
+                raise InvalidArgumentError(
+                    "dynamics", expected=f"a column of {self.nx} expressions", actual=f"shape {value.shape}"
+                )
+            return value
+
+        try:
+            reached = f(x) if discrete else rk4_expression(f, x, self.dt)
+            return ca.Function("model", [x, u, theta], [ca.cse(reached)], ["x", "u", "p"], ["x_next"])
+        except (TypeError, NotImplementedError, RuntimeError) as error:
+            raise InvalidArgumentError(
+                "dynamics",
+                expected="a function of CasADi SX expressions",
+                actual=f"{type(error).__name__}: {error}",
+                hint="Use casadi.sin, casadi.vertcat, casadi.if_else ... instead of numpy, math and Python's if.",
+            ) from error
+
+    def expression(self, x: ca.SX, u: ca.SX, theta: ca.SX) -> ca.SX:
+        """The successor state ``(nx, 1)`` for x ``(nx, 1)``, u ``(nu, 1)`` and this model's flat parameters."""
+        return self.function(x, u, theta)
+
+    def __call__(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """The successor states ``(..., nx)`` of x ``(..., nx)`` under u ``(..., nu)``, with the current parameters."""
+        states, inputs = np.asarray(x, np.float64), np.asarray(u, np.float64)
+        flat = self.function(states.reshape(-1, self.nx).T, inputs.reshape(-1, self.nu).T, self.space.theta)
+        return np.asarray(flat.full().T).reshape(states.shape)
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description; the function in CasADi's own serialisation."""
+        return super().to_json() | {
+            "nx": self.nx,
+            "nu": self.nu,
+            "dt": self.dt,
+            "function": self.function.serialize(),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Model:
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FileFormatError: If the function is damaged, not a plain expression, or of other shapes.
+        """
+        model = cls.__new__(cls)
+        model.nx, model.nu, model.dt = int(data["nx"]), int(data["nu"]), float(data["dt"])
+        model.space = blocks_from_json(data)
+        sizes = (model.nx, model.nu, model.space.size)
+        model.function = function_from_text(data["function"], "model", inputs=sizes, output=model.nx)
+        return model
+
+
+def rk4_expression(f: Callable[[ca.SX], ca.SX], x: ca.SX, dt: float) -> ca.SX:
+    """One classical Runge-Kutta step of dx/dt = f(x) from ``x (nx, 1)`` over ``dt`` s."""
+    k1 = f(x)
+    k2 = f(x + 0.5 * dt * k1)
+    k3 = f(x + 0.5 * dt * k2)
+    k4 = f(x + dt * k3)
+    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)

@@ -1,0 +1,321 @@
+"""theta: the parameters of an MPC as one named, flat, bounded float64 vector.
+
+A *block* is one parameter with a name and a natural shape (a mass, a weight matrix). Its coordinates in theta are
+chosen such that every theta within the bounds gives a well-posed MPC: a positive semidefinite matrix W = C C' is
+represented by its lower-triangular factor C. The same numbers enter CasADi as NLP parameters and torch as a tensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+
+Array = NDArray[np.float64]
+Kind = Literal["free", "psd"]
+Group = Literal["model", "cost", "terminal", "reference"]
+
+_PSD_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number or array that may be learned, with its bounds.
+
+    Args:
+        value: Initial value; any shape of at most two dimensions.
+        low: Lower bound, a number or an array of the value's shape.
+        high: Upper bound, likewise.
+        unit: Physical unit, for people.
+
+    Raises:
+        InvalidArgumentError: If the value is not finite or lies outside the bounds.
+    """
+
+    value: ArrayLike
+    low: ArrayLike = -np.inf
+    high: ArrayLike = np.inf
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        value, low, high = (np.asarray(v, dtype=np.float64) for v in (self.value, self.low, self.high))
+        if not np.isfinite(value).all() or value.ndim > 2:
+            raise InvalidArgumentError(
+                "Parameter value", expected="finite numbers, at most 2 dimensions", actual=str(self.value)
+            )
+        if not ((low <= value) & (value <= high)).all():
+            raise InvalidArgumentError(
+                "Parameter value", expected=f"a value from {self.low} to {self.high}", actual=str(self.value)
+            )
+
+
+@dataclass(frozen=True)
+class Block:
+    """One named parameter inside theta.
+
+    Attributes:
+        name: Name, dotted once it is part of an MPC (``"model.m"``).
+        shape: Natural shape: ``()``, ``(n,)`` or ``(n, m)``.
+        theta: Its coordinates, ``(size,)``: the entries in row-major order, or for ``kind="psd"`` the lower triangle of C
+            in ``W = C C'``, row by row.
+        low: Lower bounds of the coordinates, ``(size,)``.
+        high: Upper bounds, ``(size,)``.
+        kind: ``"free"`` or ``"psd"``.
+        group: What it belongs to; learning selects by group.
+        unit: Physical unit, for people.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    theta: Array = field(repr=False)
+    low: Array = field(repr=False)
+    high: Array = field(repr=False)
+    kind: Kind = "free"
+    group: Group = "cost"
+    unit: str = ""
+
+    @classmethod
+    def free(cls, name: str, parameter: Parameter | ArrayLike, group: Group) -> Block:
+        """A block whose coordinates are its entries."""
+        spec = parameter if isinstance(parameter, Parameter) else Parameter(parameter)
+        value = np.asarray(spec.value, dtype=np.float64)
+        low, high = (np.broadcast_to(np.asarray(b, np.float64), value.shape) for b in (spec.low, spec.high))
+        return cls(name, value.shape, value.ravel(), low.ravel(), high.ravel(), "free", group, spec.unit)
+
+    @classmethod
+    def psd(cls, name: str, matrix: ArrayLike, group: Group) -> Block:
+        """A positive semidefinite ``(n, n)`` block, represented by its lower-triangular factor.
+
+        Raises:
+            InvalidArgumentError: If the matrix is not square, symmetric, finite and positive semidefinite.
+        """
+        value = np.atleast_2d(np.asarray(matrix, dtype=np.float64))
+        factor = psd_factor(value, name)
+        rows, columns = np.tril_indices(len(value))
+        low = np.where(rows == columns, 0.0, -np.inf)
+        return cls(name, value.shape, factor[rows, columns], low, np.full(len(rows), np.inf), "psd", group)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.theta)
+
+    @property
+    def value(self) -> Array:
+        """The parameter in its natural shape."""
+        return self.natural(self.theta)
+
+    @property
+    def coordinate_names(self) -> list[str]:
+        """A name for each coordinate, e.g. ``"stage_cost.W[1,0]"``."""
+        if self.kind == "psd":
+            return [f"{self.name}[{i},{j}]" for i, j in zip(*np.tril_indices(self.shape[0]), strict=True)]
+        if not self.shape:
+            return [self.name]
+        return [f"{self.name}[{','.join(map(str, index))}]" for index in np.ndindex(*self.shape)]
+
+    def natural(self, theta: Array) -> Array:
+        """The parameter in its natural shape, from coordinates ``(size,)``."""
+        if self.kind == "psd":
+            factor = np.zeros(self.shape)
+            factor[np.tril_indices(self.shape[0])] = theta
+            return factor @ factor.T
+        return theta.reshape(self.shape).copy()
+
+    def coordinates(self, value: ArrayLike) -> Array:
+        """Coordinates ``(size,)`` of a parameter given in its natural shape.
+
+        Raises:
+            InvalidArgumentError: If it has another shape, or a PSD block gets a matrix that is not PSD.
+        """
+        array = np.asarray(value, dtype=np.float64)
+        if array.shape != self.shape:
+            raise InvalidArgumentError(self.name, expected=f"shape {self.shape}", actual=f"shape {array.shape}")
+        if self.kind == "psd":
+            return psd_factor(array, self.name)[np.tril_indices(self.shape[0])]
+        return array.ravel().copy()
+
+    def symbolic(self, theta: ca.SX) -> ca.SX:
+        """The parameter as CasADi matrix from symbolic coordinates; a PSD block gives its *factor* C."""
+        rows = self.shape[0] if self.shape else 1
+        columns = self.shape[1] if len(self.shape) == 2 else 1
+        if self.kind == "psd":
+            factor = ca.SX.zeros(rows, rows)
+            for k, (i, j) in enumerate(zip(*np.tril_indices(rows), strict=True)):
+                factor[int(i), int(j)] = theta[k]
+            return factor
+        return ca.reshape(theta, columns, rows).T  # CasADi is column-major
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description; infinite bounds become null."""
+        return {
+            "name": self.name,
+            "shape": list(self.shape),
+            "theta": self.theta.tolist(),
+            "low": [None if np.isinf(v) else v for v in self.low.tolist()],
+            "high": [None if np.isinf(v) else v for v in self.high.tolist()],
+            "kind": self.kind,
+            "group": self.group,
+            "unit": self.unit,
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Block:
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FileFormatError: If sizes or kinds do not belong together.
+        """
+        theta = np.array(data["theta"], dtype=np.float64)
+        low = np.array([-np.inf if v is None else v for v in data["low"]], dtype=np.float64)
+        high = np.array([np.inf if v is None else v for v in data["high"]], dtype=np.float64)
+        shape = tuple(int(n) for n in data["shape"])
+        block = cls(data["name"], shape, theta, low, high, data["kind"], data["group"], data["unit"])
+        n = shape[0] if shape else 1
+        size = n * (n + 1) // 2 if block.kind == "psd" else int(np.prod(shape))
+        if block.kind not in ("free", "psd") or not len(theta) == len(low) == len(high) == size:
+            raise FileFormatError(f"parameter {block.name}", expected=f"{size} coordinates", actual=str(data))
+        return block
+
+
+class ParameterSpace(Sequence[Block]):
+    """The blocks of an MPC in order: packs them into theta, unpacks theta, knows bounds and names.
+
+    Args:
+        blocks: The blocks; names must be unique.
+    """
+
+    def __init__(self, blocks: Sequence[Block]) -> None:
+        self.blocks = tuple(blocks)
+        self.slices: dict[str, slice] = {}
+        start = 0
+        for block in self.blocks:
+            if block.name in self.slices:
+                raise InvalidArgumentError("parameter names", expected="unique names", actual=f"{block.name} twice")
+            self.slices[block.name] = slice(start, start + block.size)
+            start += block.size
+        self.size = start
+
+    def __len__(self) -> int:
+        return len(self.blocks)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.blocks[index]
+
+    def __iter__(self) -> Iterator[Block]:
+        return iter(self.blocks)
+
+    @property
+    def theta(self) -> Array:
+        """The current parameter vector, ``(size,)``."""
+        return self._concatenated([block.theta for block in self.blocks])
+
+    @property
+    def low(self) -> Array:
+        """Lower bounds, ``(size,)``."""
+        return self._concatenated([block.low for block in self.blocks])
+
+    @property
+    def high(self) -> Array:
+        """Upper bounds, ``(size,)``."""
+        return self._concatenated([block.high for block in self.blocks])
+
+    @property
+    def names(self) -> list[str]:
+        """One name a coordinate."""
+        return [name for block in self.blocks for name in block.coordinate_names]
+
+    def mask(self, groups: Sequence[str]) -> NDArray[np.bool_]:
+        """Which coordinates belong to one of the groups, ``(size,)``."""
+        parts = [np.full(block.size, block.group in groups) for block in self.blocks]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=bool)
+
+    def unpack(self, theta: Array) -> dict[str, Array]:
+        """The parameters by name in their natural shapes, from theta ``(size,)``."""
+        return {block.name: block.natural(theta[self.slices[block.name]]) for block in self.blocks}
+
+    def pack(self, values: Mapping[str, ArrayLike]) -> Array:
+        """Theta ``(size,)`` with the named parameters (natural shapes) replaced.
+
+        Raises:
+            UnknownIdError: For a name that no block has.
+            InvalidArgumentError: For a wrong shape, a matrix that is not PSD, or a value out of bounds.
+        """
+        theta = self.theta
+        by_name = {block.name: block for block in self.blocks}
+        for name, value in values.items():
+            if name not in by_name:
+                raise UnknownIdError.of("parameter", name, by_name)
+            theta[self.slices[name]] = by_name[name].coordinates(value)
+        return self.checked(theta)
+
+    def checked(self, theta: ArrayLike) -> Array:
+        """Theta as float64 ``(size,)``, refused when of the wrong shape, not finite or out of bounds.
+
+        Raises:
+            InvalidArgumentError: Names the coordinate, its bounds and its value.
+        """
+        array = np.asarray(theta, dtype=np.float64)
+        if array.shape != (self.size,):
+            raise InvalidArgumentError("theta", expected=f"shape ({self.size},)", actual=f"shape {array.shape}")
+        slack = 1e-12 * (1.0 + np.abs(array))
+        bad = ~((array >= self.low - slack) & (array <= self.high + slack) & np.isfinite(array))
+        if bad.any():
+            k = int(np.flatnonzero(bad)[0])
+            raise InvalidArgumentError(
+                f"theta[{k}] ({self.names[k]})",
+                expected=f"a finite number from {self.low[k]} to {self.high[k]}",
+                actual=str(array[k]),
+            )
+        return array
+
+    def symbols(self, theta: ca.SX) -> dict[str, ca.SX]:
+        """The parameters by name as CasADi matrices (PSD blocks as factors), from symbolic theta."""
+        return {block.name: block.symbolic(theta[self.slices[block.name]]) for block in self.blocks}
+
+    def with_theta(self, theta: Array) -> ParameterSpace:
+        """The same blocks with other values."""
+        return ParameterSpace([replace(block, theta=np.array(theta[self.slices[block.name]])) for block in self.blocks])
+
+    @staticmethod
+    def _concatenated(parts: list[Array]) -> Array:
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def psd_factor(matrix: Array, name: str = "matrix") -> Array:
+    """The lower-triangular C ``(n, n)`` with C C' = matrix and a non-negative diagonal; works for singular matrices.
+
+    Raises:
+        InvalidArgumentError: If the matrix is not square, finite, symmetric and positive semidefinite.
+    """
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise InvalidArgumentError(name, expected="a square matrix", actual=f"shape {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise InvalidArgumentError(name, expected="finite entries", actual=str(matrix.tolist()))
+    scale = max(1.0, float(np.abs(matrix).max()))
+    asymmetry = float(np.abs(matrix - matrix.T).max())
+    if asymmetry > _PSD_TOLERANCE * scale:
+        raise InvalidArgumentError(
+            name,
+            expected="a symmetric matrix",
+            actual=f"entries that differ from their mirror by {asymmetry:.3g}",
+        )
+    eigenvalues, vectors = np.linalg.eigh((matrix + matrix.T) / 2.0)
+    if eigenvalues[0] < -_PSD_TOLERANCE * scale:
+        raise InvalidArgumentError(
+            name,
+            expected="a positive semidefinite matrix",
+            actual=f"smallest eigenvalue {eigenvalues[0]:.3g}",
+        )
+    try:
+        return np.asarray(np.linalg.cholesky((matrix + matrix.T) / 2.0))
+    except np.linalg.LinAlgError:  # singular: QR of the symmetric square root's factor
+        upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T, mode="r")
+        signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
+        return np.asarray((upper * signs[:, None]).T)

@@ -1,0 +1,162 @@
+"""The one protocol of all solvers: a batch of states in, a :class:`Solution` out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.mpc import MPC
+
+Array = NDArray[np.float64]
+
+
+class Plan(NamedTuple):
+    """State and input trajectories, the warm start of the next solve; a row of NaN stands for "no warm start".
+
+    Attributes:
+        x: States, ``(B, N + 1, nx)``.
+        u: Inputs, ``(B, N, nu)``.
+    """
+
+    x: Array
+    u: Array
+
+    @classmethod
+    def none(cls, n_problems: int, mpc: MPC) -> Plan:
+        """A plan that warm-starts nothing."""
+        x = np.full((n_problems, mpc.horizon + 1, mpc.nx), np.nan)
+        return cls(x, np.full((n_problems, mpc.horizon, mpc.nu), np.nan))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which rows hold a plan, ``(B,)``."""
+        return np.asarray(np.isfinite(self.u).all(axis=(1, 2)) & np.isfinite(self.x).all(axis=(1, 2)))
+
+    def shifted(self) -> Plan:
+        """The plan one step later, its last input held."""
+        x = np.concatenate([self.x[:, 1:], self.x[:, -1:]], axis=1)
+        return Plan(x, np.concatenate([self.u[:, 1:], self.u[:, -1:]], axis=1))
+
+    def select(self, keep: NDArray[np.bool_]) -> Plan:
+        """The plan with the other rows forgotten."""
+        x, u = self.x.copy(), self.u.copy()
+        x[~keep], u[~keep] = np.nan, np.nan
+        return Plan(x, u)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver found. For a single state ``(nx,)`` all arrays lack the leading dimension B.
+
+    Attributes:
+        u0: First inputs, ``(B, nu)``: the policy pi_theta.
+        x: State trajectories, ``(B, N + 1, nx)``.
+        u: Input trajectories, ``(B, N, nu)``.
+        value: V_theta(s), or Q_theta(s, a) where ``u0`` was given, ``(B,)``.
+        success: Whether the trajectory was checked to be a solution: it obeys model and bounds, and the solver's
+            optimality test passed. ``(B,)``
+        status: The solver's own words, one a problem.
+        stats: Figures of the call: ``iterations`` ``(B,)`` and ``time`` in s.
+    """
+
+    u0: Array
+    x: Array
+    u: Array
+    value: Array
+    success: NDArray[np.bool_]
+    status: list[str] = field(repr=False)
+    stats: dict[str, Any] = field(repr=False)
+
+    @property
+    def plan(self) -> Plan:
+        """The trajectories, for the next call's ``warm_start``."""
+        return Plan(self.x, self.u) if self.x.ndim == 3 else Plan(self.x[None], self.u[None])
+
+    def unbatched(self) -> Solution:
+        """The solution of the only problem, without the batch dimension."""
+        stats = {k: v[0] if isinstance(v, np.ndarray) else v for k, v in self.stats.items()}
+        return Solution(self.u0[0], self.x[0], self.u[0], self.value[0], self.success[0], self.status, stats)
+
+
+class Solver(ABC):
+    """Solves (MPC) for batches of states.
+
+    Args:
+        mpc: The problem. Its parameters are the default ``theta``; another theta never rebuilds the solver.
+    """
+
+    name: str
+
+    def __init__(self, mpc: MPC) -> None:
+        self.mpc = mpc
+
+    def solve(
+        self,
+        x: ArrayLike,
+        theta: ArrayLike | None = None,
+        u0: ArrayLike | None = None,
+        warm_start: Plan | Solution | None = None,
+    ) -> Solution:
+        """Solves (MPC), or (Q_th) where the first input is given.
+
+        Args:
+            x: Initial states, ``(B, nx)`` or ``(nx,)``.
+            theta: Parameters, ``(size,)``; the MPC's own by default.
+            u0: First inputs that are imposed, ``(B, nu)`` or ``(nu,)``.
+            warm_start: A plan near the solution (an earlier solution, shifted); rows of NaN start cold.
+
+        Returns:
+            The solution; unbatched for ``x`` of shape ``(nx,)``. A failed problem is reported in ``success``, not raised.
+
+        Raises:
+            InvalidArgumentError: For a wrong shape, NaN, an imposed input out of bounds, or theta out of bounds.
+        """
+        states = _checked("x", x, self.mpc.nx)
+        imposed = None if u0 is None else self._checked_inputs(u0, len(states))
+        parameters = self.mpc.theta if theta is None else self.mpc.space.checked(theta)
+        plan = warm_start.plan if isinstance(warm_start, Solution) else warm_start
+        if plan is not None:
+            expected = (len(states), self.mpc.horizon, self.mpc.nu)
+            if plan.u.shape != expected:
+                raise InvalidArgumentError("warm_start.u", expected=f"shape {expected}", actual=f"shape {plan.u.shape}")
+        solution = self._solve(states, parameters, imposed, plan or Plan.none(len(states), self.mpc))
+        return solution.unbatched() if np.ndim(x) == 1 else solution
+
+    def value(self, x: ArrayLike, theta: ArrayLike | None = None) -> Array:
+        """V_theta(s) of (MPC), ``(B,)`` or a scalar; +inf where no solution was found."""
+        solution = self.solve(x, theta)
+        return np.where(solution.success, solution.value, np.inf)
+
+    def q_value(self, x: ArrayLike, u: ArrayLike, theta: ArrayLike | None = None) -> Array:
+        """Q_theta(s, a) of (Q_th), ``(B,)`` or a scalar; +inf where no solution was found."""
+        solution = self.solve(x, theta, u0=u)
+        return np.where(solution.success, solution.value, np.inf)
+
+    @abstractmethod
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
+        """Solves the batch; arguments are checked, ``x`` is ``(B, nx)``."""
+
+    def _checked_inputs(self, u0: ArrayLike, n_problems: int) -> Array:
+        inputs = _checked("u0", u0, self.mpc.nu)
+        if len(inputs) != n_problems:
+            raise InvalidArgumentError("u0", expected=f"{n_problems} rows, as x", actual=f"{len(inputs)} rows")
+        low, high = np.asarray(self.mpc.action_low), np.asarray(self.mpc.action_high)
+        slack = 1e-6 * np.where(np.isfinite(high - low), high - low, 0.0)  # float32 actions touch their bounds
+        if ((inputs < low - slack) | (inputs > high + slack)).any():
+            raise InvalidArgumentError("u0", expected=f"inputs from {low} to {high}", actual=str(inputs))
+        return np.clip(inputs, low, high)
+
+
+def _checked(name: str, value: ArrayLike, size: int) -> Array:
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        raise InvalidArgumentError(name, expected=f"shape (B, {size}) or ({size},)", actual=f"shape {array.shape}")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(np.atleast_2d(array)).all(axis=1))[0])
+        raise InvalidArgumentError(name, expected="finite numbers", actual=f"{np.atleast_2d(array)[row]} in row {row}")
+    return np.atleast_2d(array)
