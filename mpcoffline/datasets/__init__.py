@@ -1,1 +1,33 @@
 """Recording, storing and reading transitions."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .collection import collect
+    from .minari_store import list_datasets, load_dataset
+    from .recorder import MinariRecorder
+    from .transitions import TransitionTable
+
+__all__ = ["MinariRecorder", "TransitionTable", "collect", "list_datasets", "load_dataset"]
+
+# Loaded when first used: the recorder needs Stable-Baselines3 and with it torch, seconds of importing.
+_HOMES = {
+    "MinariRecorder": "recorder",
+    "TransitionTable": "transitions",
+    "collect": "collection",
+    "list_datasets": "minari_store",
+    "load_dataset": "minari_store",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,55 @@
+"""Checks of the arrays that become a transition table; an error names column, episode and step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpcoffline.errors import InvalidDataError
+
+
+def floats(name: str, column: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
+    """The values as float64 with ``ndim`` dimensions, or an ``InvalidDataError``."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidDataError(f"{name}: {column}", expected="an array of numbers", actual=str(error)) from error
+    if array.ndim != ndim:
+        shape = "(n,)" if ndim == 1 else "(n, columns)"
+        raise InvalidDataError(f"{name}: {column}", expected=f"shape {shape}", actual=str(array.shape))
+    return array
+
+
+def checked_episode_ids(name: str, values: ArrayLike, length: int) -> NDArray[np.int64]:
+    """The ids as int64 ``(length,)``, or an ``InvalidDataError``."""
+    ids = np.asarray(values)
+    if ids.shape != (length,) or not np.issubdtype(ids.dtype, np.integer):
+        raise InvalidDataError(
+            f"{name}: episode_ids", expected=f"{length} integers", actual=f"{ids.dtype} of shape {ids.shape}"
+        )
+    return ids.astype(np.int64)
+
+
+def check_finite(name: str, rows: NDArray[np.float32], ny: int, nu: int, episode_ids: NDArray[np.int64] | None) -> None:
+    """Refuses the first NaN or inf of packed rows ``(n, 2 ny + nu + 2)`` with ``InvalidDataError``."""
+    bad = ~np.isfinite(rows)
+    if not bad.any():
+        return
+    labels = [f"observation {i}" for i in range(ny)] + [f"action {i}" for i in range(nu)] + ["cost"]
+    labels += [f"next observation {i}" for i in range(ny)] + ["termination"]
+    row, column = (int(i) for i in np.argwhere(bad)[0])
+    raise InvalidDataError(
+        f"{name}, {place(episode_ids, row)}: {labels[column]}",
+        expected="a finite number (in float32)",
+        actual=f"{rows[row, column]} ({int(bad.any(axis=1).sum())} such rows)",
+        hint="Remove these transitions, or find out how they came to be.",
+    )
+
+
+def place(episode_ids: NDArray[np.int64] | None, row: int) -> str:
+    """Where a row stands, in words: its episode and the step within, or its number."""
+    if episode_ids is None:
+        return f"row {row}"
+    episode = int(episode_ids[row])
+    step = row - int(np.flatnonzero(episode_ids == episode)[0])
+    return f"episode {episode}, step {step}"

@@ -1,0 +1,273 @@
+"""The Minari store on this machine: finding, loading and writing data sets, atomically."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib.metadata
+import importlib.resources
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
+
+from .recipes import TASKS, Recipe, catalog_file
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from minari.data_collector import EpisodeBuffer
+
+GRAMMAR = "(namespace/)*name-vN of letters, digits, '-' and '_' (no dots; a namespace has two characters or more)"
+
+
+@dataclass(frozen=True)
+class DatasetRow:
+    """A data set that :func:`load_dataset` can give.
+
+    Attributes:
+        id: Minari id.
+        where: ``"local"`` (in the Minari store) or ``"shipped"`` (with this package, not yet in the store).
+        episodes: Number of episodes.
+        steps: Number of transitions.
+    """
+
+    id: str
+    where: str
+    episodes: int
+    steps: int
+
+
+def load_dataset(dataset_id: str) -> MinariDataset:
+    """Gives a data set out of the local Minari store, or one that ships with this package.
+
+    A shipped data set is put into the store when it is first asked for (about two seconds); after that
+    ``minari.load_dataset`` finds it without this package.
+
+    Args:
+        dataset_id: Minari id, e.g. ``"mpcoffline/pendulum/ddpg-v0"``.
+
+    Raises:
+        UnknownIdError: For an id that is neither; it names the nearest ones.
+        FileFormatError: For a damaged data set, or a shipped file that does not have its sha256.
+    """
+    import minari
+
+    if is_valid_id(dataset_id):
+        if is_local(dataset_id):
+            return _load_local(dataset_id)
+        if dataset_id in shipped_datasets():
+            return _materialise(dataset_id, shipped_datasets()[dataset_id])
+    known = sorted({*minari.list_local_datasets(), *shipped_datasets()})
+    nearest = difflib.get_close_matches(str(dataset_id), known, n=3, cutoff=0.4)
+    hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}? " if nearest else ""
+    raise UnknownIdError.of(
+        "data set id", str(dataset_id), known, hint=f"{hint}`mpcoffline collect` records a new one."
+    )
+
+
+def list_datasets() -> list[DatasetRow]:
+    """All data sets that :func:`load_dataset` can give, sorted by id."""
+    import minari
+
+    from .packed import packed_size
+
+    rows = {
+        name: DatasetRow(name, "local", int(metadata["total_episodes"]), int(metadata["total_steps"]))
+        for name, metadata in minari.list_local_datasets().items()
+    }
+    for name, file in shipped_datasets().items():
+        if name not in rows:
+            with importlib.resources.as_file(catalog_file(file)) as path:
+                rows[name] = DatasetRow(name, "shipped", *packed_size(path))
+    return [rows[name] for name in sorted(rows)]
+
+
+def shipped_datasets() -> dict[str, str]:
+    """The shipped data sets: Minari id to the name of the packed file in the catalogue."""
+    return {Recipe.load(task).dataset_id: f"{task}.h5" for task in TASKS if catalog_file(f"{task}.h5").is_file()}
+
+
+def dataset_path(dataset_id: str) -> Path:
+    """The folder of a data set in the local Minari store, whether it exists or not."""
+    from minari.storage import get_dataset_path
+
+    return Path(get_dataset_path(dataset_id))
+
+
+def is_local(dataset_id: str) -> bool:
+    """Whether the local Minari store holds the data set."""
+    return (dataset_path(dataset_id) / "data").exists()
+
+
+def is_valid_id(dataset_id: object) -> bool:
+    """Whether Minari can parse the id; such an id also stays inside the store as a path."""
+    from minari.dataset.minari_dataset import DATASET_ID_RE
+
+    match = DATASET_ID_RE.fullmatch(dataset_id) if isinstance(dataset_id, str) else None
+    return match is not None and match.group("version") is not None and "//" not in match.group()
+
+
+def check_dataset_id(dataset_id: str) -> None:
+    """Refuses an id that Minari could not parse.
+
+    Raises:
+        InvalidArgumentError: Naming Minari's grammar.
+    """
+    if not is_valid_id(dataset_id):
+        raise InvalidArgumentError("dataset_id", expected=f"an id {GRAMMAR}", actual=repr(dataset_id))
+
+
+def check_new_dataset(dataset_id: str, *, overwrite: bool) -> None:
+    """Refuses an id that is malformed, or that exists unless ``overwrite``.
+
+    Raises:
+        InvalidArgumentError: For either.
+    """
+    check_dataset_id(dataset_id)
+    if is_local(dataset_id) and not overwrite:
+        raise InvalidArgumentError(
+            "dataset_id",
+            expected="the id of a new data set",
+            actual=f"{dataset_id!r}, which exists in {dataset_path(dataset_id)}",
+            hint="Choose another version number, or pass overwrite=True.",
+        )
+
+
+def write_dataset(
+    dataset_id: str,
+    episodes: Iterable[EpisodeBuffer],
+    *,
+    env_spec: EnvSpec | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    algorithm_name: str | None = None,
+    description: str | None = None,
+    overwrite: bool = False,
+) -> MinariDataset:
+    """Stores episodes as a Minari data set, which appears complete or not at all.
+
+    ``minari.create_dataset_from_buffers`` writes in place, so that a full disk or a killed process leaves
+    half a data set under the final name. This does the same with the same storage class, but in a hidden
+    folder that is renamed when complete.
+
+    Args:
+        dataset_id: Minari id.
+        episodes: The episodes.
+        env_spec: Spec of the environment; None where it has none (it cannot be recovered then).
+        observation_space: Space of the observations.
+        action_space: Space of the actions.
+        algorithm_name: Metadata: what produced the data.
+        description: Metadata: what the data are.
+        overwrite: Whether an existing data set is replaced.
+
+    Returns:
+        The stored data set.
+
+    Raises:
+        InvalidArgumentError: For a malformed id, one that exists, or no episode at all.
+    """
+    import minari
+    from minari.dataset.minari_storage import MinariStorage
+
+    check_new_dataset(dataset_id, overwrite=overwrite)
+    buffers = list(episodes)
+    if not buffers:
+        raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
+    target = dataset_path(dataset_id)
+    root = dataset_path("")
+    # Hidden from Minari's listing; in the store, so that the rename stays in one file system.
+    building = Path(tempfile.mkdtemp(prefix=".building-", dir=root))
+    try:
+        storage = MinariStorage.new(
+            building / "data",
+            observation_space=observation_space,
+            action_space=action_space,
+            env_spec=env_spec,
+        )
+        metadata = {
+            "dataset_id": dataset_id,
+            "minari_version": importlib.metadata.version("minari"),
+            "algorithm_name": algorithm_name,
+            "description": description,
+        }
+        storage.update_metadata({key: value for key, value in metadata.items() if value is not None})
+        storage.update_episodes(buffers)
+        building.chmod(0o755)
+        _declare_namespace(dataset_id)
+        _swap_in(building, target, overwrite=overwrite)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return minari.load_dataset(dataset_id)
+
+
+def _load_local(dataset_id: str) -> MinariDataset:
+    import minari
+
+    try:
+        return minari.load_dataset(dataset_id)
+    except (ValueError, KeyError, OSError) as error:
+        # An interrupted writer of another tool leaves such folders: an empty metadata.json, no HDF5 file.
+        raise FileFormatError(
+            f"data set {dataset_id!r} in {dataset_path(dataset_id)}",
+            expected="a complete Minari data set",
+            actual=f"{type(error).__name__}: {error}",
+            hint="Remove that folder; a shipped data set comes back when it is loaded again.",
+        ) from error
+
+
+def _materialise(dataset_id: str, file: str) -> MinariDataset:
+    """Puts a shipped data set into the store, after checking that its file is the one that was shipped."""
+    from .packed import unpack
+
+    sums = catalog_file("SHA256SUMS").read_text(encoding="utf-8").splitlines()
+    expected = {name: digest for digest, name in (line.split() for line in sums if line.strip())}
+    with importlib.resources.as_file(catalog_file(file)) as path:
+        actual = hashlib.sha256(path.read_bytes()).hexdigest()
+        if actual != expected.get(file):
+            raise FileFormatError(
+                f"shipped file {path}",
+                expected=f"sha256 {expected.get(file, '(none listed)')}",
+                actual=actual,
+                hint="Reinstall mpcoffline.",
+            )
+        try:
+            return unpack(path, dataset_id)
+        except (OSError, MPCOfflineError):
+            # Another process was faster: its copy is as good as ours.
+            if not is_local(dataset_id):
+                raise
+            return _load_local(dataset_id)
+
+
+def _swap_in(building: Path, target: Path, *, overwrite: bool) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if overwrite and target.exists():
+        old = Path(tempfile.mkdtemp(prefix=".replaced-", dir=building.parent))
+        os.rename(target, old / "dataset")
+        os.rename(building, target)
+        shutil.rmtree(old)
+    else:
+        os.rename(building, target)
+
+
+def _declare_namespace(dataset_id: str) -> None:
+    """Creates Minari's record of the namespace, which its remotes ask for."""
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.namespace import create_namespace, list_local_namespaces
+
+    namespace, _, _ = parse_dataset_id(dataset_id)
+    if namespace is not None and namespace not in list_local_namespaces():
+        try:
+            create_namespace(namespace)
+        except ValueError:
+            # Another process declared it in the meantime; anything else is an error.
+            if namespace not in list_local_namespaces():
+                raise

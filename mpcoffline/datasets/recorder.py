@@ -1,0 +1,168 @@
+"""Recording what an off-policy agent does while it learns, as a Minari data set."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from mpcoffline.errors import InvalidArgumentError
+
+from .episodes import EpisodeBuilder
+from .minari_store import check_new_dataset, write_dataset
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from minari.data_collector import EpisodeBuffer
+
+
+class MinariRecorder(BaseCallback):
+    """An SB3 callback that writes every transition of an off-policy run into a Minari data set.
+
+    Works with any number of environments and any off-policy algorithm (DDPG, TD3, SAC, ...), and costs the
+    training no random number. A transition is recorded as the environment saw it:
+
+    * observations before any normalisation by ``VecNormalize``, s+ of a finished episode from
+      ``infos[i]["terminal_observation"]`` (a ``VecEnv`` has already reset by then);
+    * actions in the environment's units, after exploration noise and clipping;
+    * reward = ``-info["cost"]`` in float64 where the environment gives its stage cost, since a ``VecEnv``
+      rounds rewards to float32 and training wrappers may have scaled them; else the reward itself;
+    * ``infos/cost (T+1, 1)`` and ``infos/state (T+1, nx)`` in float64 where the environment gives them.
+      Row 0 is the reset's; it is NaN for an episode that was already under way when recording began.
+
+    Termination and truncation stay apart. An episode that is unfinished when training ends is kept, its last
+    step marked as truncated. The data set stores the spec of the environment without training wrappers, so
+    that ``dataset.recover_environment()`` rebuilds it.
+
+    Args:
+        dataset_id: Minari id of the new data set, ``(namespace/)*name-vN``.
+        overwrite: Whether an existing data set of this id may be replaced (at the end of training).
+        algorithm_name: Stored as metadata; the name of the algorithm's class by default.
+        description: Stored as metadata.
+        verbose: SB3's verbosity.
+
+    Attributes:
+        dataset: The stored data set; None before the end of training.
+
+    Raises:
+        InvalidArgumentError: At construction for an id against Minari's grammar, or one that exists; at the
+            start of training for an on-policy algorithm or for observations that are not a Box.
+
+    Example:
+        ``agent.learn(50_000, callback=MinariRecorder("mpcoffline/pendulum/mine-v0"))``
+    """
+
+    def __init__(
+        self,
+        dataset_id: str,
+        *,
+        overwrite: bool = False,
+        algorithm_name: str | None = None,
+        description: str | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        check_new_dataset(dataset_id, overwrite=overwrite)
+        self.dataset_id = dataset_id
+        self.overwrite = overwrite
+        self.algorithm_name = algorithm_name
+        self.description = description
+        self.dataset: MinariDataset | None = None
+        self._finished: list[EpisodeBuffer] = []
+        self._running: list[EpisodeBuilder] = []
+        self._env_spec: EnvSpec | None = None
+
+    @property
+    def episodes(self) -> list[EpisodeBuffer]:
+        """The episodes finished so far, in the order in which they ended."""
+        return list(self._finished)
+
+    def _on_training_start(self) -> None:
+        agent = self._agent()
+        # A second `learn` with this recorder extends the data set that it wrote itself.
+        check_new_dataset(self.dataset_id, overwrite=self.overwrite or self.dataset is not None)
+        self._env_spec = _plain_spec(self.training_env.get_attr("spec")[0])
+        observations = self._before(agent)
+        if agent.num_timesteps == 0:
+            infos = list(self.training_env.unwrapped.reset_infos)
+        else:
+            # SB3 goes on in the middle of an episode: the reset infos belong to another state.
+            infos = [builder.last_info for builder in self._running] or [{} for _ in observations]
+        self._running = [EpisodeBuilder(s, info) for s, info in zip(observations, infos, strict=True)]
+
+    def _on_step(self) -> bool:
+        agent, infos, dones = self._agent(), self.locals["infos"], self.locals["dones"]
+        normalizer = agent.get_vec_normalize_env()
+        reached: Any = self.locals["new_obs"] if normalizer is None else normalizer.get_original_obs()
+        for i, (info, done) in enumerate(zip(infos, dones, strict=True)):
+            next_observation = reached[i]
+            if done:
+                next_observation = info["terminal_observation"]
+                if normalizer is not None:
+                    # Back and forth through float64 and VecNormalize's clipping: SB3 keeps no original of it.
+                    back = normalizer.unnormalize_obs(next_observation)
+                    next_observation = np.asarray(back, dtype=reached.dtype)
+            truncated = bool(done) and bool(info.get("TimeLimit.truncated", False))
+            self._running[i].add(
+                self.locals["actions"][i],
+                self.locals["rewards"][i],
+                next_observation,
+                terminated=bool(done) and not truncated,
+                truncated=truncated,
+                info=info,
+            )
+            if done:
+                self._finished.append(self._running[i].finish())
+                # Now, not at the next step: an episode of one step would overwrite the reset info.
+                self._running[i] = EpisodeBuilder(reached[i], self.training_env.unwrapped.reset_infos[i])
+        return True
+
+    def _on_training_end(self) -> None:
+        unfinished = [builder.finish(truncate=True) for builder in self._running if len(builder) > 0]
+        self._finished += unfinished
+        self.dataset = write_dataset(
+            self.dataset_id,
+            self._finished,
+            env_spec=self._env_spec,
+            observation_space=self.training_env.observation_space,
+            action_space=self.training_env.action_space,
+            algorithm_name=self.algorithm_name or type(self.model).__name__,
+            description=self.description,
+            overwrite=self.overwrite or self.dataset is not None,
+        )
+
+    def _agent(self) -> OffPolicyAlgorithm:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise InvalidArgumentError(
+                "MinariRecorder's agent",
+                expected="an off-policy SB3 algorithm (DDPG, TD3, SAC, ...)",
+                actual=type(self.model).__name__,
+            )
+        if not isinstance(self.model.observation_space, spaces.Box):
+            raise InvalidArgumentError(
+                "MinariRecorder's observation space",
+                expected="a Box",
+                actual=str(self.model.observation_space),
+            )
+        return self.model
+
+    @staticmethod
+    def _before(agent: OffPolicyAlgorithm) -> np.ndarray[Any, Any]:
+        """The observations s ``(n_envs, ny)`` from which the next step starts, not normalised."""
+        before = agent._last_obs if agent.get_vec_normalize_env() is None else agent._last_original_obs
+        return np.array(before)
+
+
+def _plain_spec(spec: EnvSpec | None) -> EnvSpec | None:
+    """The spec without the training's wrappers and rendering; the time limit stays."""
+    if spec is None:
+        return None
+    plain = copy(spec)
+    plain.additional_wrappers = ()
+    plain.kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
+    return plain
