@@ -159,8 +159,7 @@ def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed:
     task = cast("ControlTask", env.unwrapped)
     scores = []
     for start in task.starts:
-        resets = [env.reset(seed=seed + i, options={"start": start})[1] for i in range(episodes)]
-        state = np.stack([info["state"] for info in resets])
+        state = starting_states(env, start, episodes, seed=seed)
         costs = np.empty((EPISODE_STEPS, episodes))
         for k in range(EPISODE_STEPS):
             action = np.asarray(agent.predict(task.observe(state), deterministic=True)[0], dtype=np.float64)
@@ -173,6 +172,12 @@ def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed:
             AgentScore(start, episodes, float(total.mean()), float(total.max()), float(discounted.mean()), success)
         )
     return scores
+
+
+def starting_states(env: gym.Env[Any, Any], start: str, episodes: int, *, seed: int = 10_000) -> NDArray[np.float64]:
+    """Initial states ``(episodes, nx)`` of the kind ``start``, one seed each from ``seed`` on."""
+    resets = (env.reset(seed=seed + i, options={"start": start})[1] for i in range(episodes))
+    return np.stack([info["state"] for info in resets])
 
 
 class _FixedScale(BaseFeaturesExtractor):
