@@ -41,7 +41,7 @@ def wrap_angle(angle: Array) -> Array:
     return np.where(wrapped <= -np.pi, np.pi, wrapped)
 
 
-class ControlTask(gym.Env[Observation, NDArray[Any]]):
+class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     """A deterministic control task with state s, observation y(s) and stage cost L(s, a); reward = -L.
 
     A task states its plant and its cost as four functions of arrays with any leading dimensions
@@ -57,8 +57,7 @@ class ControlTask(gym.Env[Observation, NDArray[Any]]):
 
     Attributes:
         dt: Sampling time in s.
-        state_low: Bounds of a state that ``reset`` accepts, ``(nx,)``.
-        state_high: Likewise.
+        state_space: States that ``reset`` accepts.
         starts: Names of the initial-state distributions, the default first.
     """
 
@@ -162,7 +161,7 @@ class ControlTask(gym.Env[Observation, NDArray[Any]]):
 
 
 def float32_box(low: list[float] | Array, high: list[float] | Array) -> spaces.Box:
-    """A float32 Box with per-coordinate bounds, rounded outwards so that the float64 bounds stay inside."""
+    """A float32 Box with per-coordinate bounds."""
     lower, upper = np.asarray(low, dtype=np.float32), np.asarray(high, dtype=np.float32)
     return spaces.Box(lower, upper, dtype=np.float32)
 

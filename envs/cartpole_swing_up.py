@@ -16,6 +16,8 @@ MAX_FORCE = 2.0
 MAX_POSITION = 1e3
 MAX_CART_SPEED = 200.0
 MAX_POLE_SPEED = 500.0
+# Starts from which no input leaves the observation bounds, and from which RK4 at this sampling time is stable.
+MAX_START = (100.0, 20.0, np.pi, 20.0)
 
 
 class CartPoleSwingUpEnv(ControlTask):
@@ -57,7 +59,8 @@ class CartPoleSwingUpEnv(ControlTask):
     ## Start, end, success
     `options={"start": "broad"}` (default): $x \sim U(-1, 1)$, $\dot x \sim U(-0.5, 0.5)$, $\varphi \sim U(-\pi, \pi)$,
     $\dot\varphi \sim U(-1, 1)$; `"hanging"`: $\varphi = \pi + U(-0.2, 0.2)$, the rest $U(-0.1, 0.1)$. Never terminates;
-    truncated after 100 steps. Success: $|\varphi| < 0.3$.
+    truncated after 100 steps. Success: $|\varphi| < 0.3$. `options={"state": s}` takes $|x| \le 100$ m,
+    $|\dot x| \le 20$ m/s, $|\dot\varphi| \le 20$ rad/s.
 
     ## References
     Sawant, Anand, Reinhardt, Gros, arXiv:2301.01667; Barto, Sutton, Anderson (1983) for the equations.
@@ -73,7 +76,7 @@ class CartPoleSwingUpEnv(ControlTask):
         self.action_space = float32_box([-MAX_FORCE], [MAX_FORCE])
         bounds = np.array([MAX_POSITION, MAX_CART_SPEED, 1.0, 1.0, MAX_POLE_SPEED])
         self.observation_space = float32_box(-bounds, bounds)
-        self.state_space = float64_box([MAX_POSITION, MAX_CART_SPEED, np.pi, MAX_POLE_SPEED])
+        self.state_space = float64_box(list(MAX_START))
 
     def derivative(self, state: Array, action: Array) -> Array:
         """The equations of motion: d[x, xd, phi, phid]/dt, ``(..., 4)``."""

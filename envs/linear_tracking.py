@@ -56,6 +56,7 @@ class LinearTrackingEnv(ControlTask):
 
     ## Start, end, success
     $s_0 \sim U[-1, 1]^4$. Never terminates; truncated after 100 steps. Success: $|(x, y)| < 0.05$.
+    `options={"state": s}` takes any state from which no input leaves the observation bounds.
 
     ## Arguments
     `alpha` (default 1.0): size of the model error, from 0 to 4.
@@ -77,7 +78,7 @@ class LinearTrackingEnv(ControlTask):
         self.A, self.B = plant_matrices(self.alpha)
         self.action_space = float32_box([-MAX_FORCE] * 2, [MAX_FORCE] * 2)
         self.observation_space = float32_box([-MAX_STATE] * 4, [MAX_STATE] * 4)
-        self.state_space = float64_box([MAX_STATE] * 4)
+        self.state_space = float64_box([start_bound(self.A, self.B)] * 4)
 
     def next_state(self, state: Array, action: Array) -> Array:
         """The plant: A s + B a."""
@@ -99,6 +100,16 @@ class LinearTrackingEnv(ControlTask):
     def sample_state(self, start: str) -> Array:
         """Uniform in [-1, 1]^4."""
         return self.np_random.uniform(-1.0, 1.0, size=4)
+
+
+def start_bound(A: Array, B: Array, n_steps: int = 100) -> float:
+    """The largest b such that from every |s| <= b no admissible input leaves the observation bounds in an episode."""
+    bound, power, forced = MAX_STATE, np.eye(len(A)), np.zeros(len(A))
+    for _ in range(n_steps):
+        forced += MAX_FORCE * np.abs(power @ B).sum(axis=1)
+        power = power @ A
+        bound = min(bound, float(((MAX_STATE - forced) / np.abs(power).sum(axis=1)).min()))
+    return bound
 
 
 def plant_matrices(alpha: float) -> tuple[Array, Array]:

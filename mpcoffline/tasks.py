@@ -43,8 +43,8 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
 
     The MPC's state is the environment's observation y, so that no angle wraps. The swing-up models integrate the
     equations of motion in y = [..., cos phi, sin phi, ...] (cos' = -phid sin, sin' = phid cos) with RK4, which needs no
-    trigonometry and stays smooth off the unit circle; per step of dt the rotation is off by (phid dt)^5/120, that is 1e-5 at
-    5 rad/s.
+    trigonometry and stays smooth off the unit circle; per step of dt the rotation is off by (phid dt)^5/120, that is
+    1e-5 at 5 rad/s.
 
     Args:
         env_id: ``"mpcoffline/LinearTracking-v0"``, ``"mpcoffline/PendulumSwingUp-v0"`` or
@@ -141,7 +141,7 @@ def _cartpole(alpha: float, seed: int | None) -> MPC:
 
 
 def _perturbed(parameters: tuple[PhysicalParameter, ...], alpha: float, seed: int | None) -> dict[str, Parameter]:
-    """The parameters with their errors; learning may move each from a hundredth to a hundred times the plant's value."""
+    """The parameters with their errors; learning may move each from 1/100 to 100 times the plant's value."""
     limit = min(parameter.true / parameter.spread for parameter in parameters)
     if not 0.0 <= alpha < limit:
         raise InvalidArgumentError(

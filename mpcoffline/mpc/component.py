@@ -8,8 +8,6 @@ from typing import Any, Protocol, Self
 
 import casadi as ca
 
-from mpcoffline.errors import FileFormatError
-
 from .parameters import Array, Block, ParameterSpace
 
 
@@ -71,30 +69,3 @@ class TerminalCost(Protocol):
 def blocks_from_json(data: Mapping[str, Any]) -> ParameterSpace:
     """The parameter blocks of a component's JSON form."""
     return ParameterSpace([Block.from_json(block) for block in data["blocks"]])
-
-
-def function_from_text(text: str, name: str, *, inputs: tuple[int, ...], output: int | None = None) -> ca.Function:
-    """A CasADi SX function from CasADi's own serialisation.
-
-    Args:
-        text: What ``Function.serialize()`` returned.
-        name: What the function is, for messages.
-        inputs: Expected sizes of its inputs.
-        output: Expected size of its one output; any when None.
-
-    Raises:
-        FileFormatError: If the text is damaged or holds anything but a plain expression graph. Function classes that
-            load compiled libraries could run foreign code, so nothing but SX functions is accepted.
-    """
-    try:
-        function = ca.Function.deserialize(text)
-    except Exception as error:  # CasADi raises bare RuntimeError, IndexError or MemoryError on damaged text
-        raise FileFormatError(name, expected="a serialised CasADi function", actual=str(error)[:200]) from error
-    if not function.is_a("SXFunction"):
-        raise FileFormatError(name, expected="an SX function", actual=function.class_name())
-    sizes = tuple(function.numel_in(i) for i in range(function.n_in()))
-    if sizes != inputs or function.n_out() != 1 or output not in (None, function.numel_out(0)):
-        raise FileFormatError(
-            name, expected=f"inputs of sizes {inputs}, {output or 'any'} outputs", actual=str(function)
-        )
-    return function

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.errors import InvalidArgumentError
 
-from .component import Component, blocks_from_json, function_from_text
+from .component import Component, blocks_from_json
+from .expressions import function_from_json, function_to_json
 from .parameters import Array, Block, Parameter, ParameterSpace
 
 Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
@@ -28,8 +29,8 @@ class Model(Component):
         >>> model = Model(ode, nx=2, nu=1, dt=0.05, parameters={"m": Parameter(1.0, low=0.1, unit="kg"), "c": 0.1})
 
     Args:
-        dynamics: ``(x, u, p) -> dx/dt``, or ``-> x+`` with ``discrete=True``. ``x`` is ``(nx, 1)``, ``u`` is ``(nu, 1)``,
-            ``p`` maps parameter names to CasADi matrices of their shapes.
+        dynamics: ``(x, u, p) -> dx/dt``, or ``-> x+`` with ``discrete=True``. ``x`` is ``(nx, 1)``, ``u`` is
+            ``(nu, 1)``, ``p`` maps parameter names to CasADi matrices of their shapes.
         nx: Number of model states (the policy's observation is the model state).
         nu: Number of inputs.
         dt: Sampling time in s.
@@ -91,18 +92,28 @@ class Model(Component):
         return self.function(x, u, theta)
 
     def __call__(self, x: ArrayLike, u: ArrayLike) -> Array:
-        """The successor states ``(..., nx)`` of x ``(..., nx)`` under u ``(..., nu)``, with the current parameters."""
+        """The successor states ``(..., nx)`` of x ``(..., nx)`` under u ``(..., nu)``, with the current parameters.
+
+        Raises:
+            InvalidArgumentError: For a last dimension other than nx or nu.
+        """
         states, inputs = np.asarray(x, np.float64), np.asarray(u, np.float64)
-        flat = self.function(states.reshape(-1, self.nx).T, inputs.reshape(-1, self.nu).T, self.space.theta)
-        return np.asarray(flat.full().T).reshape(states.shape)
+        for name, array, size in (("x", states, self.nx), ("u", inputs, self.nu)):
+            if array.ndim < 1 or array.shape[-1] != size:
+                raise InvalidArgumentError(name, expected=f"shape (..., {size})", actual=f"shape {array.shape}")
+        batch = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1])
+        states = np.broadcast_to(states, (*batch, self.nx)).reshape(-1, self.nx)
+        inputs = np.broadcast_to(inputs, (*batch, self.nu)).reshape(-1, self.nu)
+        flat = self.function(states.T, inputs.T, self.space.theta)
+        return np.asarray(flat.full().T).reshape(*batch, self.nx)
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON-able description; the function in CasADi's own serialisation."""
+        """A JSON-able description; the function as a list of instructions."""
         return super().to_json() | {
             "nx": self.nx,
             "nu": self.nu,
             "dt": self.dt,
-            "function": self.function.serialize(),
+            "function": function_to_json(self.function),
         }
 
     @classmethod
@@ -110,13 +121,13 @@ class Model(Component):
         """The inverse of :meth:`to_json`.
 
         Raises:
-            FileFormatError: If the function is damaged, not a plain expression, or of other shapes.
+            FileFormatError: If the function is damaged or of other shapes.
         """
         model = cls.__new__(cls)
         model.nx, model.nu, model.dt = int(data["nx"]), int(data["nu"]), float(data["dt"])
         model.space = blocks_from_json(data)
         sizes = (model.nx, model.nu, model.space.size)
-        model.function = function_from_text(data["function"], "model", inputs=sizes, output=model.nx)
+        model.function = function_from_json(data["function"], "model", inputs=sizes, output=model.nx)
         return model
 
 

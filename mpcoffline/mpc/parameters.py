@@ -62,8 +62,8 @@ class Block:
     Attributes:
         name: Name, dotted once it is part of an MPC (``"model.m"``).
         shape: Natural shape: ``()``, ``(n,)`` or ``(n, m)``.
-        theta: Its coordinates, ``(size,)``: the entries in row-major order, or for ``kind="psd"`` the lower triangle of C
-            in ``W = C C'``, row by row.
+        theta: Its coordinates, ``(size,)``: the entries in row-major order, or for ``kind="psd"`` the lower triangle
+            of C in ``W = C C'``, row by row.
         low: Lower bounds of the coordinates, ``(size,)``.
         high: Upper bounds, ``(size,)``.
         kind: ``"free"`` or ``"psd"``.
@@ -316,6 +316,6 @@ def psd_factor(matrix: Array, name: str = "matrix") -> Array:
     try:
         return np.asarray(np.linalg.cholesky((matrix + matrix.T) / 2.0))
     except np.linalg.LinAlgError:  # singular: QR of the symmetric square root's factor
-        upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T, mode="r")
+        upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T).R
         signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
         return np.asarray((upper * signs[:, None]).T)

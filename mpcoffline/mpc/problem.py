@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Integral, Real
 from typing import Any, Self
 
 import casadi as ca
@@ -13,8 +14,9 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
-from .component import StageCost, TerminalCost, function_from_text
+from .component import StageCost, TerminalCost
 from .cost import cost_from_json
+from .expressions import function_from_json, function_to_json
 from .model import Model
 from .parameters import Array, Group, ParameterSpace
 
@@ -57,14 +59,12 @@ class MPC:
     constraints: Constraints | ca.Function | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.horizon, bool) or int(self.horizon) != self.horizon or self.horizon < 1:
-            raise InvalidArgumentError("horizon", expected="a positive integer", actual=str(self.horizon))
-        if not 0.0 < self.discount <= 1.0:
-            raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=str(self.discount))
+        horizon, discount = _positive_integer("horizon", self.horizon), _discount(self.discount)
         low, high = (self._bounds(name) for name in ("action_low", "action_high"))
         if not (low < high).all():
             raise InvalidArgumentError("action_low", expected=f"values below action_high = {high}", actual=str(low))
-        object.__setattr__(self, "horizon", int(self.horizon))
+        object.__setattr__(self, "horizon", horizon)
+        object.__setattr__(self, "discount", discount)
         object.__setattr__(self, "action_low", low)
         object.__setattr__(self, "action_high", high)
         object.__setattr__(self, "constraints", self._constraint_function())
@@ -190,7 +190,7 @@ class MPC:
             "discount": self.discount,
             "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],
             "action_high": [_finite_or_none(v) for v in np.asarray(self.action_high)],
-            "constraints": constraints.serialize() if isinstance(constraints, ca.Function) else None,
+            "constraints": function_to_json(constraints) if isinstance(constraints, ca.Function) else None,
         }
 
     @classmethod
@@ -205,7 +205,7 @@ class MPC:
             constraints = None
             if data["constraints"] is not None:
                 sizes = (model.nx, model.nu, model.space.size)
-                constraints = function_from_text(data["constraints"], "constraints", inputs=sizes)
+                constraints = function_from_json(data["constraints"], "constraints", inputs=sizes)
             return cls(
                 model=model,
                 stage_cost=cost_from_json(data["stage_cost"]),
@@ -216,8 +216,22 @@ class MPC:
                 action_high=[np.inf if v is None else v for v in data["action_high"]],
                 constraints=constraints,
             )
-        except (KeyError, TypeError, AttributeError) as error:
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+            if isinstance(error, FileFormatError):
+                raise
             raise FileFormatError("MPC", expected="the JSON form of an MPC", actual=repr(error)) from error
+
+
+def _positive_integer(name: str, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
+        raise InvalidArgumentError(name, expected="a positive integer", actual=repr(value))
+    return int(value)
+
+
+def _discount(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) <= 1.0:
+        raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=repr(value))
+    return float(value)
 
 
 def _finite_or_none(value: float) -> float | None:

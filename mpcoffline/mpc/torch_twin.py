@@ -6,56 +6,65 @@ for the whole batch, gives the same function in torch, with autograd.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import casadi as ca
+import numpy as np
 import torch
 from torch import Tensor
 
 from mpcoffline.errors import InvalidArgumentError
 
-_Scalar = Tensor | float
+from .expressions import expanded, instructions
 
-_UNARY: dict[int, tuple[Callable[[Tensor], Tensor], Callable[[float], float]]] = {
-    ca.OP_NEG: (torch.neg, lambda a: -a),
-    ca.OP_SQ: (torch.square, lambda a: a * a),
-    ca.OP_TWICE: (lambda a: 2.0 * a, lambda a: 2.0 * a),
-    ca.OP_INV: (torch.reciprocal, lambda a: 1.0 / a),
-    ca.OP_SQRT: (torch.sqrt, math.sqrt),
-    ca.OP_EXP: (torch.exp, math.exp),
-    ca.OP_LOG: (torch.log, math.log),
-    ca.OP_LOG1P: (torch.log1p, math.log1p),
-    ca.OP_EXPM1: (torch.expm1, math.expm1),
-    ca.OP_SIN: (torch.sin, math.sin),
-    ca.OP_COS: (torch.cos, math.cos),
-    ca.OP_TAN: (torch.tan, math.tan),
-    ca.OP_ASIN: (torch.asin, math.asin),
-    ca.OP_ACOS: (torch.acos, math.acos),
-    ca.OP_ATAN: (torch.atan, math.atan),
-    ca.OP_SINH: (torch.sinh, math.sinh),
-    ca.OP_COSH: (torch.cosh, math.cosh),
-    ca.OP_TANH: (torch.tanh, math.tanh),
-    ca.OP_ASINH: (torch.asinh, math.asinh),
-    ca.OP_ACOSH: (torch.acosh, math.acosh),
-    ca.OP_ATANH: (torch.atanh, math.atanh),
-    ca.OP_FABS: (torch.abs, abs),
-    ca.OP_FLOOR: (torch.floor, math.floor),
-    ca.OP_CEIL: (torch.ceil, math.ceil),
-    ca.OP_ERF: (torch.erf, math.erf),
-    ca.OP_SIGN: (torch.sign, lambda a: float((a > 0) - (a < 0))),
-    ca.OP_NOT: (lambda a: (a == 0).to(a.dtype), lambda a: float(a == 0)),
+_Scalar = Tensor | float
+_Mask = Tensor | bool
+
+_UNARY: dict[int, Callable[[Tensor], Tensor]] = {
+    ca.OP_NEG: torch.neg,
+    ca.OP_SQ: torch.square,
+    ca.OP_TWICE: lambda a: 2.0 * a,
+    ca.OP_INV: torch.reciprocal,
+    ca.OP_SQRT: torch.sqrt,
+    ca.OP_EXP: torch.exp,
+    ca.OP_LOG: torch.log,
+    ca.OP_LOG1P: torch.log1p,
+    ca.OP_EXPM1: torch.expm1,
+    ca.OP_SIN: torch.sin,
+    ca.OP_COS: torch.cos,
+    ca.OP_TAN: torch.tan,
+    ca.OP_ASIN: torch.asin,
+    ca.OP_ACOS: torch.acos,
+    ca.OP_ATAN: torch.atan,
+    ca.OP_SINH: torch.sinh,
+    ca.OP_COSH: torch.cosh,
+    ca.OP_TANH: torch.tanh,
+    ca.OP_ASINH: torch.asinh,
+    ca.OP_ACOSH: torch.acosh,
+    ca.OP_ATANH: torch.atanh,
+    ca.OP_FABS: torch.abs,
+    ca.OP_FLOOR: torch.floor,
+    ca.OP_CEIL: torch.ceil,
+    ca.OP_ERF: torch.erf,
+    ca.OP_SIGN: torch.sign,
+    ca.OP_NOT: lambda a: (a == 0).to(a.dtype),
 }
 
-_BINARY: dict[int, Callable[[Tensor, Tensor], Tensor]] = {
-    ca.OP_ADD: torch.add,
-    ca.OP_SUB: torch.sub,
-    ca.OP_MUL: torch.mul,
-    ca.OP_DIV: torch.div,
+# These take a Python float on either side.
+_ARITHMETIC: dict[int, Callable[[Any, Any], Any]] = {
+    ca.OP_ADD: operator.add,
+    ca.OP_SUB: operator.sub,
+    ca.OP_MUL: operator.mul,
+    ca.OP_DIV: operator.truediv,
     ca.OP_POW: torch.pow,
     ca.OP_CONSTPOW: torch.pow,
-    ca.OP_FMIN: torch.minimum,
-    ca.OP_FMAX: torch.maximum,
+}
+
+_BINARY: dict[int, Callable[[Tensor, Tensor], Tensor]] = _ARITHMETIC | {
+    ca.OP_FMIN: torch.fmin,
+    ca.OP_FMAX: torch.fmax,
     ca.OP_ATAN2: torch.atan2,
     ca.OP_HYPOT: torch.hypot,
     ca.OP_FMOD: torch.fmod,
@@ -70,14 +79,12 @@ _BINARY: dict[int, Callable[[Tensor, Tensor], Tensor]] = {
     ca.OP_IF_ELSE_ZERO: lambda a, b: torch.where(a != 0, b, torch.zeros_like(b)),
 }
 
-_ARITHMETIC = {ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV}  # torch takes a Python float on either side
-
 
 class TorchTwin:
     """A CasADi function evaluated by torch, batched and differentiable in every input.
 
     Args:
-        function: A CasADi function that can be expanded to SX, with column inputs and outputs.
+        function: A CasADi function that can be expanded to SX, with column inputs and outputs; its first output counts.
 
     Raises:
         InvalidArgumentError: If the function cannot be expanded to SX or uses an operation without a torch counterpart.
@@ -85,24 +92,27 @@ class TorchTwin:
 
     def __init__(self, function: ca.Function) -> None:
         self.name = function.name()
-        expanded = _expanded(function)
-        self._n_in = [expanded.numel_in(i) for i in range(expanded.n_in())]
-        self._n_out = [expanded.numel_out(i) for i in range(expanded.n_out())]
-        self._work_size = expanded.sz_w()
-        self._program = [
-            (
-                expanded.instruction_id(k),
-                expanded.instruction_input(k),
-                expanded.instruction_output(k),
-                expanded.instruction_constant(k) if expanded.instruction_id(k) == ca.OP_CONST else 0.0,
-            )
-            for k in range(expanded.n_instructions())
-        ]
-        for op, *_ in self._program:
-            if op not in _UNARY and op not in _BINARY and op not in (ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT):
+        flat = expanded(function)
+        self._n_in = [flat.numel_in(i) for i in range(flat.n_in())]
+        self._n_out = flat.numel_out(0)
+        # (operation, operands, constant); operands are places in this list, as every result is kept once.
+        self._program: list[tuple[int, list[int], float]] = []
+        self._outputs = [0] * self._n_out
+        latest: dict[int, int] = {}  # place in CasADi's work vector -> place in the program
+        for op, sources, targets, constant in instructions(flat):
+            if op == ca.OP_OUTPUT:
+                if targets[0] == 0:
+                    self._outputs[targets[1]] = latest[sources[0]]
+                continue
+            if op not in _UNARY and op not in _BINARY and op not in (ca.OP_CONST, ca.OP_INPUT):
                 raise InvalidArgumentError(
                     self.name, expected="operations that torch has", actual=f"CasADi operation {op}"
                 )
+            operands = sources[:1] if op in _UNARY else sources
+            places = list(operands) if op == ca.OP_INPUT else [latest[source] for source in operands]
+            latest[targets[0]] = len(self._program)
+            self._program.append((op, places, constant))
+        self._branches = any(op == ca.OP_IF_ELSE_ZERO for op, *_ in self._program)
 
     def __call__(self, *inputs: Tensor) -> Tensor:
         """Evaluates the function.
@@ -115,67 +125,82 @@ class TorchTwin:
             The first output, ``(..., m)``, of the broadcast leading shape and the inputs' dtype.
 
         Raises:
-            InvalidArgumentError: If an input's last dimension is not the function's.
+            InvalidArgumentError: If the number of inputs or an input's last dimension is not the function's.
         """
+        if len(inputs) != len(self._n_in):
+            raise InvalidArgumentError(self.name, expected=f"{len(self._n_in)} inputs", actual=str(len(inputs)))
         for i, (tensor, size) in enumerate(zip(inputs, self._n_in, strict=True)):
-            if tensor.shape[-1] != size:
+            if tensor.ndim == 0 or tensor.shape[-1] != size:
                 raise InvalidArgumentError(
                     f"input {i} of {self.name}",
                     expected=f"shape (..., {size})",
                     actual=f"shape {tuple(tensor.shape)}",
                 )
         columns = [tensor.unbind(-1) for tensor in inputs]
-        work: list[_Scalar] = [0.0] * self._work_size
-        result: list[_Scalar] = [0.0] * self._n_out[0]
-        for op, sources, targets, constant in self._program:
+        needed: list[_Mask] | None = None
+        if self._branches and torch.is_grad_enabled():
+            with torch.no_grad():
+                needed = self._needed(self._replayed(columns, inputs[0], None))
+        work = self._replayed(columns, inputs[0], needed)
+        shape = np.broadcast_shapes(*(tuple(tensor.shape[:-1]) for tensor in inputs))
+        return torch.stack([_tensor(work[k], inputs[0]).expand(shape) for k in self._outputs], dim=-1)
+
+    def _replayed(
+        self, columns: Sequence[Sequence[Tensor]], like: Tensor, needed: Sequence[_Mask] | None
+    ) -> list[_Scalar]:
+        """The result of every instruction."""
+        work: list[_Scalar] = []
+        for k, (op, places, constant) in enumerate(self._program):
             if op == ca.OP_CONST:
-                work[targets[0]] = constant
+                work.append(constant)
             elif op == ca.OP_INPUT:
-                work[targets[0]] = columns[sources[0]][sources[1]]
-            elif op == ca.OP_OUTPUT:
-                if targets[0] == 0:
-                    result[targets[1]] = work[sources[0]]
-            elif op in _UNARY:
-                work[targets[0]] = _unary(op, work[sources[0]])
+                work.append(columns[places[0]][places[1]])
             else:
-                work[targets[0]] = _binary(op, work[sources[0]], work[sources[1]], inputs[0])
-        shape = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in inputs))
-        full = [
-            torch.as_tensor(value, dtype=inputs[0].dtype, device=inputs[0].device).expand(shape) for value in result
-        ]
-        return torch.stack(full, dim=-1)
+                operands = [work[place] for place in places]
+                if needed is not None and isinstance(needed[k], Tensor):
+                    operands = [_cut(operand, needed[k]) for operand in operands]
+                work.append(_applied(op, operands, like))
+        return work
+
+    def _needed(self, work: Sequence[_Scalar]) -> list[_Mask]:
+        """Where the outputs depend on each result: everywhere (True), or outside the branches not taken.
+
+        In a branch that is not taken, derivatives may be infinite or NaN, and autograd would multiply them by zero.
+        """
+        needed: list[_Mask] = [False] * len(self._program)
+        for place in self._outputs:
+            needed[place] = True
+        for k in reversed(range(len(self._program))):
+            op, places, _ = self._program[k]
+            if op in (ca.OP_CONST, ca.OP_INPUT):
+                continue
+            for i, place in enumerate(places):
+                mask: Any = needed[k]
+                if op == ca.OP_IF_ELSE_ZERO and i == 1:
+                    mask = mask & (work[places[0]] != 0)
+                needed[place] = True if needed[place] is True or mask is True else needed[place] | mask
+        return needed
 
 
-def _expanded(function: ca.Function) -> ca.Function:
-    """The function as one SX function with dense outputs and common subexpressions shared."""
-    try:
-        symbols = [ca.SX.sym(f"i{i}", function.numel_in(i)) for i in range(function.n_in())]
-        shaped = [ca.reshape(s, *function.size_in(i)) for i, s in enumerate(symbols)]
-        outputs = function.expand().call(shaped) if not function.is_a("SXFunction") else function.call(shaped)
-        return ca.Function(function.name(), symbols, [ca.densify(ca.cse(ca.vec(y))) for y in outputs])
-    except RuntimeError as error:
-        raise InvalidArgumentError(
-            function.name(), expected="a function that CasADi can expand to SX", actual=str(error)[:200]
-        ) from error
+def _cut(operand: _Scalar, needed: _Mask) -> _Scalar:
+    """The operand with no gradient where it is not needed."""
+    if isinstance(operand, Tensor) and operand.requires_grad:
+        return torch.where(torch.as_tensor(needed), operand, operand.detach())
+    return operand
 
 
-def _unary(op: int, a: _Scalar) -> _Scalar:
-    on_tensor, on_float = _UNARY[op]
-    return on_tensor(a) if isinstance(a, Tensor) else on_float(a)
-
-
-def _binary(op: int, a: _Scalar, b: _Scalar, like: Tensor) -> _Scalar:
-    if op in _ARITHMETIC and (isinstance(a, Tensor) or isinstance(b, Tensor)):
-        return _BINARY[op](a, b) if isinstance(a, Tensor) else _reflected(op, a, b)
-    if op in (ca.OP_POW, ca.OP_CONSTPOW) and isinstance(a, Tensor) and not isinstance(b, Tensor):
-        return torch.pow(a, b)
-    left, right = (torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in (a, b))
+def _applied(op: int, operands: Sequence[_Scalar], like: Tensor) -> _Scalar:
+    """One operation on tensors and numbers; a number if all operands are numbers."""
+    if not any(isinstance(operand, Tensor) for operand in operands):
+        return float(_applied(op, [torch.tensor(operand, dtype=torch.float64) for operand in operands], like))
+    if op in _UNARY:
+        return _UNARY[op](_tensor(operands[0], like))
+    if op in _ARITHMETIC:
+        result: Tensor = _ARITHMETIC[op](*operands)
+        return result
+    left, right = (_tensor(operand, like) for operand in operands)
     return _BINARY[op](left, right)
 
 
-def _reflected(op: int, a: float, b: _Scalar) -> _Scalar:
-    if op == ca.OP_ADD:
-        return b + a
-    if op == ca.OP_MUL:
-        return b * a
-    return a - b if op == ca.OP_SUB else a / b
+def _tensor(value: _Scalar, like: Tensor) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=like.dtype, device=like.device)

@@ -111,7 +111,8 @@ class Solver(ABC):
             warm_start: A plan near the solution (an earlier solution, shifted); rows of NaN start cold.
 
         Returns:
-            The solution; unbatched for ``x`` of shape ``(nx,)``. A failed problem is reported in ``success``, not raised.
+            The solution; unbatched for ``x`` of shape ``(nx,)``. A failed problem is reported in
+            ``success``, not raised.
 
         Raises:
             InvalidArgumentError: For a wrong shape, NaN, an imposed input out of bounds, or theta out of bounds.
@@ -121,9 +122,12 @@ class Solver(ABC):
         parameters = self.mpc.theta if theta is None else self.mpc.space.checked(theta)
         plan = warm_start.plan if isinstance(warm_start, Solution) else warm_start
         if plan is not None:
-            expected = (len(states), self.mpc.horizon, self.mpc.nu)
-            if plan.u.shape != expected:
-                raise InvalidArgumentError("warm_start.u", expected=f"shape {expected}", actual=f"shape {plan.u.shape}")
+            template = Plan.none(len(states), self.mpc)
+            for name, given, expected in zip(("x", "u"), plan, template, strict=True):
+                if given.shape != expected.shape:
+                    raise InvalidArgumentError(
+                        f"warm_start.{name}", expected=f"shape {expected.shape}", actual=f"shape {given.shape}"
+                    )
         solution = self._solve(states, parameters, imposed, plan or Plan.none(len(states), self.mpc))
         return solution.unbatched() if np.ndim(x) == 1 else solution
 
@@ -154,7 +158,7 @@ class Solver(ABC):
 
 def _checked(name: str, value: ArrayLike, size: int) -> Array:
     array = np.asarray(value, dtype=np.float64)
-    if array.ndim not in (1, 2) or array.shape[-1] != size:
+    if array.ndim not in (1, 2) or array.shape[-1] != size or not array.size:
         raise InvalidArgumentError(name, expected=f"shape (B, {size}) or ({size},)", actual=f"shape {array.shape}")
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(np.atleast_2d(array)).all(axis=1))[0])

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, Plan, Solution, Solver
@@ -39,6 +40,8 @@ class IpoptSolver(Solver):
         self, mpc: MPC, *, n_starts: int | None = None, tolerance: float = 1e-8, max_iterations: int = 300
     ) -> None:
         super().__init__(mpc)
+        if n_starts is not None and not 1 <= n_starts <= _N_CANDIDATES:
+            raise InvalidArgumentError("n_starts", expected=f"from 1 to {_N_CANDIDATES}", actual=str(n_starts))
         self._n_starts = n_starts or (1 if is_linear(mpc) else 4)
         nlp = _nonlinear_program(mpc)
         common = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
@@ -192,7 +195,7 @@ def _ipopt(name: str, nlp: dict[str, ca.SX], options: dict[str, Any], extra: dic
 
 def _rollout_function(mpc: MPC) -> ca.Function:
     """``(s, inputs (nu, K*N), theta) -> states (nx, K*N), costs (1, K)``: the model run open loop from one state."""
-    x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
+    u, theta = ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
     # The running cost is carried along as one more state: (x, J, gamma^k).
     carried = ca.SX.sym("carried", mpc.nx + 2)
     state, total, weight = carried[: mpc.nx], carried[mpc.nx], carried[mpc.nx + 1]
@@ -209,7 +212,6 @@ def _rollout_function(mpc: MPC) -> ca.Function:
     last = path[:, -1]
     cost = last[mpc.nx] + last[mpc.nx + 1] * mpc.terminal_function(last[: mpc.nx], p)
     one = ca.Function("one", [s, inputs, p], [path[: mpc.nx, :], cost])
-    del x
     return one.map("all", "serial", _N_CANDIDATES, [0, 2], [])
 
 

@@ -1,0 +1,150 @@
+"""CasADi functions as plain lists of scalar instructions: what files hold, and what the torch twin replays.
+
+CasADi's own serialisation is not used in files: reading it can load a compiled library that the text names, that is,
+run foreign code. A list of arithmetic instructions cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
+
+_UNARY = (  # noqa: SIM905 -- one per line would fill the page
+    "acos acosh asin asinh atan atanh ceil cos cosh erf erfinv exp expm1 fabs floor inv log log1p neg not sign sin sinh"
+    " sq sqrt tan tanh twice"
+).split()
+_BINARY = (  # noqa: SIM905
+    "add and atan2 constpow copysign div eq fmax fmin fmod hypot if_else_zero le lt mul ne or pow remainder sub"
+).split()
+_CODES: dict[str, int] = {name: getattr(ca, f"OP_{name.upper()}") for name in (*_UNARY, *_BINARY)}
+_NAMES = {code: name for name, code in _CODES.items()}
+
+
+class Instruction(NamedTuple):
+    """One scalar instruction of an SX function.
+
+    Attributes:
+        op: CasADi's operation code.
+        sources: Places in the work vector that it reads; for an input the pair (input, element).
+        targets: The place that it writes; for an output the pair (output, element).
+        constant: The number of a constant.
+    """
+
+    op: int
+    sources: list[int]
+    targets: list[int]
+    constant: float
+
+
+def expanded(function: ca.Function) -> ca.Function:
+    """The function as one SX function of columns, with dense outputs and common subexpressions shared.
+
+    Raises:
+        InvalidArgumentError: If CasADi cannot expand it.
+    """
+    try:
+        symbols = [ca.SX.sym(f"i{i}", function.numel_in(i)) for i in range(function.n_in())]
+        shaped = [ca.reshape(s, *function.size_in(i)) for i, s in enumerate(symbols)]
+        outputs = function.expand().call(shaped) if not function.is_a("SXFunction") else function.call(shaped)
+        return ca.Function(function.name(), symbols, [ca.densify(ca.cse(ca.vec(y))) for y in outputs])
+    except RuntimeError as error:
+        raise InvalidArgumentError(
+            function.name(), expected="a function that CasADi can expand to SX", actual=str(error)[:200]
+        ) from error
+
+
+def instructions(function: ca.Function) -> Iterator[Instruction]:
+    """The instructions of an SX function in order."""
+    for k in range(function.n_instructions()):
+        op = function.instruction_id(k)
+        constant = function.instruction_constant(k) if op == ca.OP_CONST else 0.0
+        yield Instruction(op, function.instruction_input(k), function.instruction_output(k), constant)
+
+
+def function_to_json(function: ca.Function) -> dict[str, Any]:
+    """A CasADi function of one output as JSON-able instructions.
+
+    Raises:
+        InvalidArgumentError: If the function is no scalar arithmetic (it calls a compiled or interpolating function).
+    """
+    flat = expanded(function)
+    program: list[list[Any]] = []
+    for op, sources, targets, constant in instructions(flat):
+        if op == ca.OP_CONST:
+            program.append(["const", targets[0], constant if np.isfinite(constant) else repr(constant)])
+        elif op == ca.OP_INPUT:
+            program.append(["input", targets[0], *sources])
+        elif op == ca.OP_OUTPUT:
+            program.append(["output", targets[1], *sources])
+        elif op in _NAMES:
+            n = 1 if _NAMES[op] in _UNARY else 2
+            program.append([_NAMES[op], targets[0], *sources[:n]])
+        else:
+            raise InvalidArgumentError(
+                function.name(), expected="a function of plain arithmetic", actual=f"CasADi operation {op}"
+            )
+    return {
+        "inputs": [flat.numel_in(i) for i in range(flat.n_in())],
+        "output": flat.numel_out(0),
+        "instructions": program,
+    }
+
+
+def function_from_json(data: Any, name: str, *, inputs: tuple[int, ...], output: int | None = None) -> ca.Function:
+    """The inverse of :func:`function_to_json`; evaluates nothing but arithmetic, whatever the data hold.
+
+    Args:
+        data: What :func:`function_to_json` returned.
+        name: What the function is, for messages.
+        inputs: Expected sizes of its inputs.
+        output: Expected size of its output; any when None.
+
+    Raises:
+        FileFormatError: If the data are damaged or describe a function of other sizes.
+    """
+    try:
+        sizes, n_out = tuple(data["inputs"]), data["output"]
+        if sizes != inputs or output not in (None, n_out):
+            raise FileFormatError(
+                name,
+                expected=f"inputs of sizes {inputs}, {output or 'any'} outputs",
+                actual=f"inputs of sizes {sizes}, {n_out} outputs",
+            )
+        symbols = [ca.SX.sym(f"i{i}", size) for i, size in enumerate(sizes)]
+        results = _replayed(data["instructions"], [ca.vertsplit(symbol) for symbol in symbols])
+        column = ca.vertcat(*(results[k] for k in range(n_out)))
+    except (KeyError, IndexError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise FileFormatError(
+            name, expected="a list of instructions", actual=f"{type(error).__name__}: {error}"[:200]
+        ) from error
+    return ca.Function(name, symbols, [ca.densify(column)])
+
+
+def _replayed(program: list[list[Any]], inputs: list[list[ca.SX]]) -> dict[int, ca.SX]:
+    """The outputs by element, from running the program on symbols."""
+    work: dict[int, ca.SX] = {}
+    outputs: dict[int, ca.SX] = {}
+    for op, target, *arguments in program:
+        if op == "const":
+            (value,) = arguments
+            work[target] = ca.SX(float(value))
+        elif op == "input":
+            i, element = arguments
+            work[target] = dict(enumerate(inputs[i]))[element]
+        elif op == "output":
+            (source,) = arguments
+            outputs[target] = work[source]
+        elif op in _UNARY:
+            (source,) = arguments
+            work[target] = ca.SX.unary(_CODES[op], work[source])
+        else:
+            left, right = arguments
+            work[target] = ca.SX.binary(_CODES[op], work[left], work[right])
+    return outputs
