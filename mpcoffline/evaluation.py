@@ -1,0 +1,140 @@
+"""Closed loops: what a policy costs in an environment, many episodes stepped together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.errors import InvalidArgumentError
+
+Array = NDArray[np.float64]
+
+
+class Predictor(Protocol):
+    """Anything with SB3's ``predict``: an :class:`MPCPolicy`, an SB3 algorithm or policy."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Any]:
+        """Actions for a batch of observations, and the next state."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Closed-loop figures, one entry an episode.
+
+    Attributes:
+        cost: Undiscounted cost J = sum of L, ``(n,)``.
+        discounted_cost: Jd = sum of gamma^k L, ``(n,)``.
+        success: The environment's ``info["is_success"]`` after the last step, ``(n,)``.
+        length: Steps, ``(n,)``.
+        discount: gamma of ``discounted_cost``.
+        states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment gives none.
+        actions: Actions applied, ``(T, nu)``.
+    """
+
+    cost: Array
+    discounted_cost: Array
+    success: NDArray[np.bool_]
+    length: NDArray[np.int64]
+    discount: float
+    states: list[Array] = field(repr=False)
+    actions: list[Array] = field(repr=False)
+
+    def __str__(self) -> str:
+        return (
+            f"{len(self.cost)} episodes: cost {self.cost.mean():.1f} +- {self.cost.std():.1f}, "
+            f"discounted {self.discounted_cost.mean():.2f}, success {self.success.mean():.0%}"
+        )
+
+
+def evaluate(
+    policy: Predictor,
+    env: gym.Env[Any, Any] | str,
+    n_episodes: int = 20,
+    seed: int = 0,
+    *,
+    discount: float = 0.9,
+    options: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
+) -> Evaluation:
+    """Runs a policy in closed loop.
+
+    The environment is rebuilt ``n_episodes`` times from ``env.spec``; all copies step together, so that a policy solves its
+    MPCs in batches. Episode i is reset with ``seed + i``: two policies meet the same starts.
+
+    Args:
+        policy: Anything with SB3's ``predict``.
+        env: An environment made by ``gym.make``, or its id.
+        n_episodes: Number of episodes.
+        seed: Seed of the first episode.
+        discount: gamma of the discounted cost.
+        options: ``reset`` options, the same for all episodes or one a episode.
+
+    Returns:
+        Costs and trajectories.
+
+    Raises:
+        InvalidArgumentError: For a non-positive number of episodes, options of another length, or an environment without spec.
+    """
+    if n_episodes < 1:
+        raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
+    spec = gym.spec(env) if isinstance(env, str) else env.spec
+    if spec is None:
+        raise InvalidArgumentError("env", expected="an environment made by gym.make", actual=f"{env} without a spec")
+    each = [options or {}] * n_episodes if options is None or isinstance(options, dict) else list(options)
+    if len(each) != n_episodes:
+        raise InvalidArgumentError("options", expected=f"{n_episodes} entries", actual=str(len(each)))
+    episodes = [_Episode(gym.make(spec), seed + i, option, discount) for i, option in enumerate(each)]
+    state: Any = None
+    starts = np.ones(n_episodes, dtype=bool)
+    while not all(episode.done for episode in episodes):
+        observations = np.stack([episode.observation for episode in episodes])
+        actions, state = policy.predict(observations, state=state, episode_start=starts, deterministic=True)
+        starts = np.zeros(n_episodes, dtype=bool)
+        for episode, action in zip(episodes, actions, strict=True):
+            episode.step(action)
+    return Evaluation(
+        cost=np.array([episode.cost for episode in episodes]),
+        discounted_cost=np.array([episode.discounted_cost for episode in episodes]),
+        success=np.array([episode.success for episode in episodes]),
+        length=np.array([len(episode.actions) for episode in episodes]),
+        discount=discount,
+        states=[np.array(episode.states) for episode in episodes],
+        actions=[np.array(episode.actions) for episode in episodes],
+    )
+
+
+class _Episode:
+    """One environment and what has happened in it; steps after the end are ignored."""
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int, options: dict[str, Any], discount: float) -> None:
+        self._env, self._discount = env, discount
+        self.observation, info = env.reset(seed=seed, options=options or None)
+        self.cost = self.discounted_cost = 0.0
+        self.success = self.done = False
+        self.states: list[Any] = [info.get("state", self.observation)]
+        self.actions: list[Any] = []
+
+    def step(self, action: NDArray[Any]) -> None:
+        """Steps the environment unless the episode is over."""
+        if self.done:
+            return
+        self.observation, reward, terminated, truncated, info = self._env.step(action)
+        cost = float(info.get("cost", -float(reward)))
+        self.discounted_cost += self._discount ** len(self.actions) * cost
+        self.cost += cost
+        self.states.append(info.get("state", self.observation))
+        self.actions.append(np.asarray(action, dtype=np.float64))
+        self.done = terminated or truncated
+        self.success = bool(info.get("is_success", False))
+        if self.done:
+            self._env.close()

@@ -1,0 +1,16 @@
+"""From data to theta by plain regression; no MPC is solved here (arXiv:2301.01667)."""
+
+from __future__ import annotations
+
+from .regression import FitConfig, FitResult, fit_parameters
+from .value import VALUE_METHODS, ValueConfig, ValueFunction, fit_value
+
+__all__ = [
+    "VALUE_METHODS",
+    "FitConfig",
+    "FitResult",
+    "ValueConfig",
+    "ValueFunction",
+    "fit_parameters",
+    "fit_value",
+]

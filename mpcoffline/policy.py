@@ -1,0 +1,212 @@
+"""MPCPolicy: an MPC wherever Stable-Baselines3 expects a policy."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, Self
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.policies import BasePolicy
+
+from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.mpc import MPC
+from mpcoffline.solvers import Plan, Solution, Solver, make_solver
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class SolverStats:
+    """What the solves of a policy have amounted to.
+
+    Attributes:
+        n_solves: Problems solved.
+        n_failures: Problems whose solution was not accepted; the policy fell back to the previous plan.
+        iterations: Solver iterations in all.
+        time: Time in the solver in s.
+    """
+
+    n_solves: int = 0
+    n_failures: int = 0
+    iterations: int = 0
+    time: float = 0.0
+
+
+class MPCPolicy(BasePolicy):
+    """The policy pi_theta(s) = u_0* of (MPC) with the interface of an SB3 policy.
+
+    ``predict`` solves one MPC an observation. The warm start travels in SB3's recurrent ``state``, so that nothing is
+    hidden in the policy: ``state=None`` is a cold, deterministic solve. A solve that fails does not raise in the control
+    loop: the policy applies the next input of the previous plan (or zero, within bounds), counts it in
+    :attr:`solver_stats`, and logs a warning the first time.
+
+    Args:
+        mpc: The MPC; its state is the environment's observation.
+        solver: Name of the solver, see :func:`mpcoffline.make_solver`.
+        observation_space: The environment's; unbounded by default.
+        action_space: The environment's; float32 with the MPC's input bounds by default.
+        **solver_options: Passed to the solver.
+
+    Attributes:
+        mpc: The MPC.
+        solver_stats: Counts since construction.
+    """
+
+    def __init__(
+        self,
+        mpc: MPC,
+        solver: str = "auto",
+        *,
+        observation_space: spaces.Box | None = None,
+        action_space: spaces.Box | None = None,
+        **solver_options: Any,
+    ) -> None:
+        if observation_space is None:
+            observation_space = spaces.Box(-np.inf, np.inf, (mpc.nx,), np.float32)
+        if action_space is None:
+            low, high = (np.asarray(bound, dtype=np.float32) for bound in (mpc.action_low, mpc.action_high))
+            action_space = spaces.Box(low, high, dtype=np.float32)
+        for name, space, size in (
+            ("observation_space", observation_space, mpc.nx),
+            ("action_space", action_space, mpc.nu),
+        ):
+            if space.shape != (size,):
+                raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
+        super().__init__(observation_space, action_space)
+        self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
+        self.solver_stats = SolverStats()
+        self._solver: Solver | None = None
+
+    @property
+    def solver(self) -> Solver:
+        """The solver, built when first used."""
+        if self._solver is None:
+            self._solver = make_solver(self.mpc, self.solver_name, **self.solver_options)
+        return self._solver
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: ArrayLike,
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Plan]:
+        """The optimal first inputs, and the warm start for the next call.
+
+        Args:
+            observation: ``(nx,)``, or ``(B, nx)`` for B environments.
+            state: What the previous call returned; None starts cold.
+            episode_start: ``(B,)`` booleans; environments that have just been reset start cold.
+            deterministic: Accepted for SB3; the policy is always deterministic.
+
+        Returns:
+            Actions ``(nu,)`` or ``(B, nu)`` within the bounds and in the dtype of the action space, and the state: the plan
+            shifted by one step.
+
+        Raises:
+            InvalidArgumentError: For an observation of the wrong shape or with NaN, or a state of another batch size.
+        """
+        observations = self._checked_observations(observation)
+        warm_start = self._warm_start(state, episode_start, len(observations))
+        solution = self.solver.solve(observations, warm_start=warm_start)
+        inputs, plan = self._with_fallback(solution, warm_start)
+        space = self._action_box
+        actions = np.clip(inputs.astype(space.dtype), space.low, space.high)
+        return (actions[0] if np.ndim(observation) == 1 else actions), plan
+
+    def _predict(self, observation: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
+        """A cold solve of a batch of observations, as SB3's ``forward`` of a policy; no gradients."""
+        actions, _ = self.predict(observation.detach().cpu().numpy(), deterministic=deterministic)
+        return torch.as_tensor(actions, device=observation.device)
+
+    @property
+    def _action_box(self) -> spaces.Box:
+        assert isinstance(self.action_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
+        return self.action_space
+
+    def _checked_observations(self, observation: ArrayLike) -> NDArray[np.float64]:
+        array = np.asarray(observation, dtype=np.float64)
+        if array.ndim not in (1, 2) or array.shape[-1] != self.mpc.nx:
+            raise InvalidArgumentError(
+                "observation",
+                expected=f"shape ({self.mpc.nx},) or (B, {self.mpc.nx})",
+                actual=f"shape {array.shape}",
+                hint="Is the policy used in the environment that its MPC models?",
+            )
+        if not np.isfinite(array).all():
+            raise InvalidArgumentError("observation", expected="finite numbers", actual=str(array))
+        return np.atleast_2d(array)
+
+    def _warm_start(
+        self, state: tuple[NDArray[Any], ...] | None, episode_start: ArrayLike | None, n_problems: int
+    ) -> Plan:
+        """The plan to start from, without the rows whose episode has just begun."""
+        if state is None:
+            return Plan.none(n_problems, self.mpc)
+        plan = Plan(*state)
+        if len(plan.u) != n_problems:
+            raise InvalidArgumentError(
+                "state", expected=f"the state of {n_problems} environments", actual=f"that of {len(plan.u)}"
+            )
+        if episode_start is None:
+            return plan
+        return plan.select(~np.broadcast_to(np.asarray(episode_start, dtype=bool), (n_problems,)))
+
+    def _with_fallback(self, solution: Solution, warm_start: Plan) -> tuple[NDArray[np.float64], Plan]:
+        """First inputs and the plan for the next step; where the solve failed, those of the plan before."""
+        stats, success = self.solver_stats, solution.success
+        stats.n_solves += len(success)
+        stats.iterations += int(np.sum(solution.stats["iterations"]))
+        stats.time += float(solution.stats["time"])
+        if success.all():
+            return solution.u0, solution.plan.shifted()
+        if stats.n_failures == 0:
+            reasons = sorted({solution.status[i] for i in np.flatnonzero(~success)})
+            logger.warning("An MPC was not solved (%s): applying the previous plan.", ", ".join(reasons))
+        stats.n_failures += int((~success).sum())
+        zero = np.clip(0.0, np.asarray(self.mpc.action_low), np.asarray(self.mpc.action_high))
+        usable = warm_start.known[:, None]
+        previous = np.where(usable, np.nan_to_num(warm_start.u[:, 0]), zero)
+        chosen, next_plan, old_plan = success[:, None, None], solution.plan.shifted(), warm_start.shifted()
+        plan = Plan(np.where(chosen, next_plan.x, old_plan.x), np.where(chosen, next_plan.u, old_plan.u))
+        return np.where(success[:, None], solution.u0, previous), plan
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes the policy to a zip of JSON (no pickle)."""
+        observation_space = self.observation_space
+        assert isinstance(observation_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
+        document = {
+            "mpc": self.mpc.to_json(),
+            "solver": self.solver_name,
+            "solver_options": self.solver_options,
+            "observation_space": box_to_json(observation_space),
+            "action_space": box_to_json(self._action_box),
+        }
+        write_archive(path, "policy", document)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], device: torch.device | str = "auto") -> Self:  # type: ignore[override]
+        """Reads what :meth:`save` wrote.
+
+        Args:
+            path: The file.
+            device: Accepted for SB3; MPCs are solved on the CPU.
+
+        Raises:
+            FileFormatError: If the file is damaged, foreign or of another version.
+        """
+        document, _ = read_archive(path, "policy")
+        with file_errors(path):
+            return cls(
+                MPC.from_json(document["mpc"]),
+                document["solver"],
+                observation_space=box_from_json(document["observation_space"]),
+                action_space=box_from_json(document["action_space"]),
+                **document["solver_options"],
+            )
