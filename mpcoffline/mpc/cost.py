@@ -170,7 +170,7 @@ def cost_from_json(data: Mapping[str, Any]) -> Any:
         FileFormatError: For an unknown kind of cost.
     """
     kind = data.get("kind")
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise FileFormatError("cost", expected=f"one of {', '.join(_KINDS)}", actual=repr(kind))
     return _KINDS[kind].from_json(data)
 

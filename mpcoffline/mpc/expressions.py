@@ -66,6 +66,22 @@ def instructions(function: ca.Function) -> Iterator[Instruction]:
         yield Instruction(op, function.instruction_input(k), function.instruction_output(k), constant)
 
 
+def traced(name: str, function: ca.Function) -> ca.Function:
+    """The SX function itself, refused where tracing lost an expression: ``math.sin(x)`` of a symbol is silently NaN.
+
+    Raises:
+        InvalidArgumentError: If a constant of the function is NaN.
+    """
+    if any(np.isnan(instruction.constant) for instruction in instructions(function)):
+        raise InvalidArgumentError(
+            name,
+            expected="a function of CasADi SX expressions",
+            actual="one with a constant NaN",
+            hint="Use casadi.sin ... instead of math.sin, which turns symbols into NaN.",
+        )
+    return function
+
+
 def function_to_json(function: ca.Function) -> dict[str, Any]:
     """A CasADi function of one output as JSON-able instructions.
 

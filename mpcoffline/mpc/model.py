@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from mpcoffline.errors import InvalidArgumentError
 
 from .component import Component, blocks_from_json
-from .expressions import function_from_json, function_to_json
+from .expressions import function_from_json, function_to_json, traced
 from .parameters import Array, Block, Parameter, ParameterSpace
 
 Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
@@ -78,7 +78,7 @@ class Model(Component):
 
         try:
             reached = f(x) if discrete else rk4_expression(f, x, self.dt)
-            return ca.Function("model", [x, u, theta], [ca.cse(reached)], ["x", "u", "p"], ["x_next"])
+            function = ca.Function("model", [x, u, theta], [ca.cse(reached)], ["x", "u", "p"], ["x_next"])
         except (TypeError, NotImplementedError, RuntimeError) as error:
             raise InvalidArgumentError(
                 "dynamics",
@@ -86,6 +86,7 @@ class Model(Component):
                 actual=f"{type(error).__name__}: {error}",
                 hint="Use casadi.sin, casadi.vertcat, casadi.if_else ... instead of numpy, math and Python's if.",
             ) from error
+        return traced("dynamics", function)
 
     def expression(self, x: ca.SX, u: ca.SX, theta: ca.SX) -> ca.SX:
         """The successor state ``(nx, 1)`` for x ``(nx, 1)``, u ``(nu, 1)`` and this model's flat parameters."""

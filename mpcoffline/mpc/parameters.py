@@ -170,7 +170,7 @@ class Block:
         """The inverse of :meth:`to_json`.
 
         Raises:
-            FileFormatError: If sizes or kinds do not belong together.
+            FileFormatError: If sizes or kinds do not belong together, or coordinates are out of bounds.
         """
         theta = np.array(data["theta"], dtype=np.float64)
         low = np.array([-np.inf if v is None else v for v in data["low"]], dtype=np.float64)
@@ -179,8 +179,13 @@ class Block:
         block = cls(data["name"], shape, theta, low, high, data["kind"], data["group"], data["unit"])
         n = shape[0] if shape else 1
         size = n * (n + 1) // 2 if block.kind == "psd" else int(np.prod(shape))
-        if block.kind not in ("free", "psd") or not len(theta) == len(low) == len(high) == size:
+        square = block.kind == "free" or (block.kind == "psd" and shape == (n, n))
+        if not square or not theta.shape == low.shape == high.shape == (size,):
             raise FileFormatError(f"parameter {block.name}", expected=f"{size} coordinates", actual=str(data))
+        try:
+            ParameterSpace([block]).checked(theta)
+        except InvalidArgumentError as error:
+            raise FileFormatError(f"parameter {block.name}", expected=error.expected, actual=error.actual) from error
         return block
 
 

@@ -16,7 +16,7 @@ from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import StageCost, TerminalCost
 from .cost import cost_from_json
-from .expressions import function_from_json, function_to_json
+from .expressions import function_from_json, function_to_json, traced
 from .model import Model
 from .parameters import Array, Group, ParameterSpace
 
@@ -149,7 +149,7 @@ class MPC:
         x, u, theta = self._symbols()
         p = self.stage_cost.space.symbols(self._part("stage_cost", theta))
         cost = _scalar("stage_cost", lambda: self.stage_cost.expression(x, u, p), self.nx, self.nu)
-        return ca.Function("stage_cost", [x, u, theta], [cost], ["x", "u", "theta"], ["cost"])
+        return traced("stage_cost", ca.Function("stage_cost", [x, u, theta], [cost], ["x", "u", "theta"], ["cost"]))
 
     @cached_property
     def terminal_function(self) -> ca.Function:
@@ -157,7 +157,7 @@ class MPC:
         x, _, theta = self._symbols()
         p = self.terminal_cost.space.symbols(self._part("terminal_cost", theta))
         cost = _scalar("terminal_cost", lambda: self.terminal_cost.terminal_expression(x, p), self.nx, self.nu)
-        return ca.Function("terminal_cost", [x, theta], [cost], ["x", "theta"], ["cost"])
+        return traced("terminal_cost", ca.Function("terminal_cost", [x, theta], [cost], ["x", "theta"], ["cost"]))
 
     @cached_property
     def constraint_function(self) -> ca.Function | None:
@@ -177,10 +177,17 @@ class MPC:
         if self.constraints is None or isinstance(self.constraints, ca.Function):
             return self.constraints
         x, u, p = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu), ca.SX.sym("p", self.model.space.size)
-        h = ca.densify(ca.SX(self.constraints(x, u, self.model.space.symbols(p))))
+        try:
+            h = ca.densify(ca.SX(self.constraints(x, u, self.model.space.symbols(p))))
+        except (TypeError, NotImplementedError, RuntimeError) as error:
+            raise InvalidArgumentError(
+                "constraints",
+                expected="a function of CasADi SX expressions",
+                actual=f"{type(error).__name__}: {error}",
+            ) from error
         if h.shape[1] != 1:
             raise InvalidArgumentError("constraints", expected="a column", actual=f"shape {h.shape}")
-        return ca.Function("constraints", [x, u, p], [h])
+        return traced("constraints", ca.Function("constraints", [x, u, p], [h]))
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description from which :meth:`from_json` rebuilds the problem."""
