@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -80,11 +80,10 @@ def collect_with(recipe: Recipe, *, overwrite: bool = False, progress: bool = Tr
         algorithm_name=f"stable_baselines3.{recipe.algorithm}",
         description=recipe.description,
     )
-    callbacks: list[BaseCallback] = [recorder]
-    if progress:
-        callbacks.append(_ProgressBar(recipe.steps, recorder, f"{recipe.algorithm} learns {recipe.task}"))
+    bar = _ProgressBar(recipe.steps, recorder, f"{recipe.algorithm} learns {recipe.task}") if progress else None
+    callbacks: list[BaseCallback] = [recorder, _StopAt(recipe.steps), *([bar] if bar else [])]
     # Two small networks: threads only get in each other's way.
-    with _torch_threads(1):
+    with _torch_threads(1), bar.shown() if bar else nullcontext():
         agent = make_agent(recipe)
         agent.learn(recipe.steps, callback=callbacks)
     if recorder.dataset is None:
@@ -218,6 +217,17 @@ def _noise(recipe: Recipe, shape: tuple[int, ...]) -> ActionNoise:
     )
 
 
+class _StopAt(BaseCallback):
+    """Ends training after exactly this many steps; SB3 itself finishes its ``train_freq`` steps first."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self._steps = steps
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps < self._steps
+
+
 class _ProgressBar(BaseCallback):
     """A rich progress bar with the mean return of the last episodes."""
 
@@ -237,21 +247,23 @@ class _ProgressBar(BaseCallback):
             TimeRemainingColumn(),
         )
 
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """Shows the bar, and gives the terminal back however the training ends."""
+        with self._bar:
+            yield
+
     def _on_training_start(self) -> None:
         self._task = self._bar.add_task(self._title, total=self._steps, mean="-")
-        self._bar.start()
 
     def _on_step(self) -> bool:
-        episodes = self._recorder.episodes
-        for episode in episodes[self._counted :]:
-            self._returns.append(float(np.sum(episode.rewards)))
-        self._counted = len(episodes)
+        if any(self.locals["dones"]):
+            episodes = self._recorder.episodes
+            self._returns.extend(float(np.sum(episode.rewards)) for episode in episodes[self._counted :])
+            self._counted = len(episodes)
         mean = f"{np.mean(self._returns):.1f}" if self._returns else "-"
         self._bar.update(self._task, completed=min(self.num_timesteps, self._steps), mean=mean)
         return True
-
-    def _on_training_end(self) -> None:
-        self._bar.stop()
 
 
 @contextmanager
