@@ -278,7 +278,7 @@ class TransitionTable:
         """
         if not 0.0 < fraction <= 1.0:
             raise InvalidArgumentError("fraction", expected="a number in (0, 1]", actual=str(fraction))
-        size = np.abs(self.observations)
+        size = np.abs(self.observations, dtype=np.float64)  # ratios of float32 numbers can overflow
         scale = np.median(size, axis=0)
         scale = np.where(scale > 0.0, scale, size.mean(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
