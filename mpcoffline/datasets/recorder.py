@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from copy import copy
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
@@ -87,6 +89,7 @@ class MinariRecorder(BaseCallback):
         # A second `learn` with this recorder extends the data set that it wrote itself.
         check_new_dataset(self.dataset_id, overwrite=self.overwrite or self.dataset is not None)
         self._env_spec = _plain_spec(self.training_env.get_attr("spec")[0])
+        self._warn_of_changed_spaces()
         observations = self._before(agent)
         if agent.num_timesteps == 0:
             infos = list(self.training_env.unwrapped.reset_infos)
@@ -135,6 +138,21 @@ class MinariRecorder(BaseCallback):
             description=self.description,
             overwrite=self.overwrite or self.dataset is not None,
         )
+
+    def _warn_of_changed_spaces(self) -> None:
+        """Warns where a training wrapper changes what is recorded, so that the spec does not rebuild it."""
+        if self._env_spec is None:
+            return
+        plain = gym.make(self._env_spec)
+        for kind in ("observation_space", "action_space"):
+            recorded, original = getattr(self.training_env, kind), getattr(plain, kind)
+            if recorded != original:
+                warnings.warn(
+                    f"MinariRecorder: a wrapper changes the {kind} to {recorded}, and that is what gets recorded;"
+                    f" dataset.recover_environment() gives {original}. Scale inside the agent instead.",
+                    stacklevel=2,
+                )
+        plain.close()
 
     def _agent(self) -> OffPolicyAlgorithm:
         if not isinstance(self.model, OffPolicyAlgorithm):

@@ -131,7 +131,9 @@ def test_the_environment_comes_back_without_the_training_wrappers() -> None:
     wrapped = gym.wrappers.RescaleObservation(
         gym.make(LINEAR, alpha=0.25, max_episode_steps=30), np.float32(-1.0), np.float32(1.0)
     )
-    agent_on(wrapped).learn(40, callback=MinariRecorder("mpcoffline/test/spec-v0"))
+    agent = agent_on(wrapped)
+    with pytest.warns(UserWarning, match="a wrapper changes the observation_space"):
+        agent.learn(40, callback=MinariRecorder("mpcoffline/test/spec-v0"))
     env = minari.load_dataset("mpcoffline/test/spec-v0").recover_environment()
     assert env.spec is not None
     assert env.spec.id == LINEAR
