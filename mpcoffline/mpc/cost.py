@@ -92,18 +92,18 @@ class QuadraticCost(Component):
 
     def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that e'We = |C'e|^2."""
-        e = x - p["x_ref"]
+        e = _difference("x", x, p["x_ref"])
         if "H" in p:
-            return ca.sumsqr(p["H"].T @ ca.vertcat(e, u - p["u_ref"])) + p["constant"]
+            return ca.sumsqr(p["H"].T @ ca.vertcat(e, _difference("u", u, p["u_ref"]))) + p["constant"]
         cost = ca.sumsqr(p["W"].T @ e) + p["constant"]
         if "R" in p:
-            cost += ca.sumsqr(p["R"].T @ (u - p["u_ref"]))
+            cost += ca.sumsqr(p["R"].T @ _difference("u", u, p["u_ref"]))
         return cost
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """E'We + constant as a CasADi scalar."""
         factor = p["W"] if "W" in p else p["H"][: self.nx, :]
-        return ca.sumsqr(factor.T @ (x - p["x_ref"])) + p["constant"]
+        return ca.sumsqr(factor.T @ _difference("x", x, p["x_ref"])) + p["constant"]
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> QuadraticCost:
@@ -142,7 +142,7 @@ class NormCost(Component):
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """(TERM), smoothed, as a CasADi scalar."""
-        return ca.sqrt(ca.sumsqr(x - p["x_ref"]) + self.eps**2) - self.eps
+        return ca.sqrt(ca.sumsqr(_difference("x", x, p["x_ref"])) + self.eps**2) - self.eps
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description."""
@@ -173,6 +173,15 @@ def cost_from_json(data: Mapping[str, Any]) -> Any:
     if not isinstance(kind, str) or kind not in _KINDS:
         raise FileFormatError("cost", expected=f"one of {', '.join(_KINDS)}", actual=repr(kind))
     return _KINDS[kind].from_json(data)
+
+
+def _difference(name: str, variable: ca.SX, reference: ca.SX) -> ca.SX:
+    """Variable - reference of equal sizes; CasADi alone would stretch a scalar over a vector."""
+    if variable.shape != reference.shape:
+        raise InvalidArgumentError(
+            f"{name}_ref", expected=f"{variable.shape[0]} numbers, as {name}", actual=str(reference.shape[0])
+        )
+    return variable - reference
 
 
 def _reference(name: str, given: ArrayLike | None, size: int) -> Array:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import Component, blocks_from_json
 from .expressions import function_from_json, function_to_json, traced
@@ -126,6 +126,8 @@ class Model(Component):
         """
         model = cls.__new__(cls)
         model.nx, model.nu, model.dt = int(data["nx"]), int(data["nu"]), float(data["dt"])
+        if not (np.isfinite(model.dt) and model.dt > 0.0):
+            raise FileFormatError("model.dt", expected="a positive number of seconds", actual=str(data["dt"]))
         model.space = blocks_from_json(data)
         sizes = (model.nx, model.nu, model.space.size)
         model.function = function_from_json(data["function"], "model", inputs=sizes, output=model.nx)

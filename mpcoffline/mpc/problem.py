@@ -249,7 +249,7 @@ def _scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.
     """Evaluates a cost expression, turning CasADi's dimension errors into one that says what is expected."""
     try:
         cost = ca.densify(ca.SX(expression()))
-    except RuntimeError as error:
+    except (InvalidArgumentError, RuntimeError) as error:
         raise InvalidArgumentError(
             name, expected=f"a cost for nx = {nx}, nu = {nu}", actual=str(error).splitlines()[-1]
         ) from error
