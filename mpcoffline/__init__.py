@@ -2,11 +2,91 @@
 
 The method is that of Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement
 Learning", arXiv:2301.01667. Importing this package registers the environments ``mpcoffline/LinearTracking-v0``,
-``mpcoffline/PendulumSwingUp-v0`` and ``mpcoffline/CartPoleSwingUp-v0``; torch and CasADi load when first used.
+``mpcoffline/PendulumSwingUp-v0`` and ``mpcoffline/CartPoleSwingUp-v0``; torch, CasADi, Stable-Baselines3 and Minari
+load when first used.
 """
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 
+if TYPE_CHECKING:
+    from mpcoffline.datasets import MinariRecorder, TransitionTable, collect, list_datasets, load_dataset
+    from mpcoffline.errors import (
+        FileFormatError,
+        InvalidArgumentError,
+        InvalidDataError,
+        MPCOfflineError,
+        UnknownIdError,
+    )
+    from mpcoffline.evaluation import evaluate
+    from mpcoffline.learner import OfflineMPCLearner
+    from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
+    from mpcoffline.policy import MPCPolicy
+    from mpcoffline.solvers import make_solver
+    from mpcoffline.tasks import nominal_mpc
+
 __version__ = "0.1.0"
+
+# Where each public name lives; the module is imported when the name is first used.
+_HOMES = {
+    "MPC": "mpc",
+    "Model": "mpc",
+    "NormCost": "mpc",
+    "Parameter": "mpc",
+    "QuadraticCost": "mpc",
+    "make_solver": "solvers",
+    "MPCPolicy": "policy",
+    "OfflineMPCLearner": "learner",
+    "nominal_mpc": "tasks",
+    "evaluate": "evaluation",
+    "MinariRecorder": "datasets",
+    "TransitionTable": "datasets",
+    "collect": "datasets",
+    "list_datasets": "datasets",
+    "load_dataset": "datasets",
+    "FileFormatError": "errors",
+    "InvalidArgumentError": "errors",
+    "InvalidDataError": "errors",
+    "MPCOfflineError": "errors",
+    "UnknownIdError": "errors",
+}
+
+__all__ = [
+    "MPC",
+    "FileFormatError",
+    "InvalidArgumentError",
+    "InvalidDataError",
+    "MPCOfflineError",
+    "MPCPolicy",
+    "MinariRecorder",
+    "Model",
+    "NormCost",
+    "OfflineMPCLearner",
+    "Parameter",
+    "QuadraticCost",
+    "TransitionTable",
+    "UnknownIdError",
+    "__version__",
+    "collect",
+    "evaluate",
+    "list_datasets",
+    "load_dataset",
+    "make_solver",
+    "nominal_mpc",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
