@@ -67,15 +67,6 @@ def test_swing_up_models_agree_with_one_step_of_the_environment(env_id: str, spe
     assert deviation[:, cosine : cosine + 2].max() <= 2 * (speed * 0.05) ** 5 / 120 + 0.2 * bound
 
 
-def test_the_model_keeps_a_pure_rotation_on_the_circle_to_fifth_order() -> None:
-    """Where the speed hardly changes, the truncation (w dt)^5 / 120 of the series is left."""
-    w = 5.0
-    model = nominal_mpc(PENDULUM).model
-    reached = model([1.0, 0.0, w], [0.0])
-    exact = plant_of(PENDULUM).next_state(np.array([0.0, w]), np.array([0.0]))
-    assert abs(np.arctan2(reached[1], reached[0]) - exact[0]) < 4 * (w * 0.05) ** 5 / 120
-
-
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_the_published_setup(env_id: str) -> None:
     mpc = nominal_mpc(env_id)
