@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import lzma
 import os
-import tempfile
+import struct
+import tokenize
+import uuid
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
@@ -23,6 +27,26 @@ _VERSION = 1
 _DOCUMENT, _ARRAYS = "mpcoffline.json", "arrays.npz"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal contents give equal bytes
 
+# What zipfile, zlib, json and numpy raise on damaged bytes; OSError and ValueError include their own classes.
+_DAMAGE = (
+    OSError,
+    EOFError,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    tokenize.TokenError,
+)
+# What constructors raise on a document that is not what it says.
+_MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError)
+
 
 def write_archive(
     path: str | PathLike[str], kind: str, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
@@ -35,18 +59,18 @@ def write_archive(
         document: JSON-able content.
         arrays: Numpy arrays by name.
     """
-    target = Path(path)
+    target = Path(path).resolve()
     buffer = io.BytesIO()
     np.savez(buffer, **dict(arrays or {}))  # type: ignore[arg-type]
     text = json.dumps({"format": "mpcoffline", "version": _VERSION, "kind": kind} | dict(document), indent=1)
-    handle, temporary = tempfile.mkstemp(dir=target.resolve().parent, prefix=f".{target.name}.")
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}")
     try:
-        with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        with temporary.open("xb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(zipfile.ZipInfo(_DOCUMENT, _EPOCH), text, zipfile.ZIP_DEFLATED)
             archive.writestr(zipfile.ZipInfo(_ARRAYS, _EPOCH), buffer.getvalue(), zipfile.ZIP_DEFLATED)
         os.replace(temporary, target)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -68,19 +92,19 @@ def read_archive(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], 
         with zipfile.ZipFile(path) as archive:
             document = json.loads(archive.read(_DOCUMENT))
             with np.load(io.BytesIO(archive.read(_ARRAYS)), allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
+                arrays = {name: np.asarray(stored[name]) for name in stored.files}
     except FileNotFoundError:
         raise
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
+    except _DAMAGE as error:
         raise FileFormatError(str(path), expected=f"an mpcoffline {kind} file", actual=f"{error!r}") from error
-    found = document.get("format"), document.get("kind") if isinstance(document, dict) else None
+    found = (document.get("format"), document.get("kind")) if isinstance(document, dict) else (None, None)
     if found != ("mpcoffline", kind):
         raise FileFormatError(str(path), expected=f"an mpcoffline {kind} file", actual=f"format and kind {found}")
-    if document["version"] != _VERSION:
+    if document.get("version") != _VERSION:
         raise FileFormatError(
             str(path),
             expected=f"file version {_VERSION}",
-            actual=str(document["version"]),
+            actual=str(document.get("version")),
             hint="Use the version of mpcoffline that wrote it.",
         )
     return document, arrays
@@ -95,17 +119,27 @@ def file_errors(path: str | PathLike[str]) -> Iterator[None]:
     """
     try:
         yield
-    except (KeyError, TypeError, ValueError, AttributeError, MPCOfflineError) as error:
+    except (*_MISFITS, MPCOfflineError) as error:
         raise FileFormatError(str(path), expected="a complete mpcoffline file", actual=f"{error!r}") from error
 
 
 def box_to_json(space: spaces.Box) -> dict[str, Any]:
-    """A one-dimensional Box space as JSON."""
-    return {"low": space.low.tolist(), "high": space.high.tolist(), "dtype": str(space.dtype)}
+    """A one-dimensional Box space as JSON; infinite bounds become null."""
+    low, high = ([v if np.isfinite(v) else None for v in bound.tolist()] for bound in (space.low, space.high))
+    return {"low": low, "high": high, "dtype": str(space.dtype)}
 
 
 def box_from_json(data: Mapping[str, Any]) -> spaces.Box:
-    """The inverse of :func:`box_to_json`."""
+    """The inverse of :func:`box_to_json`.
+
+    Raises:
+        FileFormatError: For another type than a float, or bounds that cross.
+    """
     dtype = np.dtype(data["dtype"])
-    low, high = (np.array(data[name], dtype=dtype) for name in ("low", "high"))
-    return spaces.Box(low, high, dtype=dtype.type)
+    low, high = (
+        np.array([infinite if v is None else v for v in data[name]], dtype=np.float64)
+        for name, infinite in (("low", -np.inf), ("high", np.inf))
+    )
+    if dtype not in (np.float32, np.float64) or low.ndim != 1 or low.shape != high.shape or not (low <= high).all():
+        raise FileFormatError("space", expected="a Box of floats with low <= high", actual=str(dict(data)))
+    return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)

@@ -8,9 +8,10 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
 Array = NDArray[np.float64]
 
@@ -68,8 +69,8 @@ def evaluate(
 ) -> Evaluation:
     """Runs a policy in closed loop.
 
-    The environment is rebuilt ``n_episodes`` times from ``env.spec``; all copies step together, so that a policy solves its
-    MPCs in batches. Episode i is reset with ``seed + i``: two policies meet the same starts.
+    The environment is rebuilt ``n_episodes`` times from ``env.spec``; all copies step together, so that a policy solves
+    its MPCs in batches. Episode i is reset with ``seed + i``: two policies meet the same starts.
 
     Args:
         policy: Anything with SB3's ``predict``.
@@ -83,11 +84,15 @@ def evaluate(
         Costs and trajectories.
 
     Raises:
-        InvalidArgumentError: For a non-positive number of episodes, options of another length, or an environment without spec.
+        InvalidArgumentError: For a non-positive number of episodes, options of another length, or an environment
+            without spec.
+        UnknownIdError: For an environment id that is not registered.
     """
     if n_episodes < 1:
         raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
-    spec = gym.spec(env) if isinstance(env, str) else env.spec
+    if not 0.0 < discount <= 1.0:
+        raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=str(discount))
+    spec = _registered(env) if isinstance(env, str) else env.spec
     if spec is None:
         raise InvalidArgumentError("env", expected="an environment made by gym.make", actual=f"{env} without a spec")
     each = [options or {}] * n_episodes if options is None or isinstance(options, dict) else list(options)
@@ -113,6 +118,18 @@ def evaluate(
     )
 
 
+def _registered(env_id: str) -> EnvSpec | None:
+    """The specification of an environment id, ``"module:id"`` too."""
+    try:
+        env: gym.Env[Any, Any] = gym.make(env_id)
+    except gym.error.UnregisteredEnv as error:
+        raise UnknownIdError(
+            "environment id", expected="a registered environment", actual=repr(env_id), hint=str(error)
+        ) from error
+    env.close()
+    return env.spec
+
+
 class _Episode:
     """One environment and what has happened in it; steps after the end are ignored."""
 
@@ -128,13 +145,15 @@ class _Episode:
         """Steps the environment unless the episode is over."""
         if self.done:
             return
-        self.observation, reward, terminated, truncated, info = self._env.step(action)
+        observation, reward, terminated, truncated, info = self._env.step(action)
         cost = float(info.get("cost", -float(reward)))
         self.discounted_cost += self._discount ** len(self.actions) * cost
         self.cost += cost
-        self.states.append(info.get("state", self.observation))
+        self.states.append(info.get("state", observation))
         self.actions.append(np.asarray(action, dtype=np.float64))
-        self.done = terminated or truncated
+        self.done = bool(terminated or truncated)
         self.success = bool(info.get("is_success", False))
         if self.done:
             self._env.close()
+        else:  # a policy goes on seeing the last state before the end, which it can solve for
+            self.observation = observation

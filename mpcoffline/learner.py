@@ -11,10 +11,11 @@ from gymnasium import spaces
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
 from mpcoffline.datasets.transitions import TransitionTable
-from mpcoffline.errors import InvalidArgumentError, MPCOfflineError, UnknownIdError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.learning import FitConfig, FitResult, ValueConfig, ValueFunction, fit_parameters, fit_value
-from mpcoffline.mpc import MPC
+from mpcoffline.learning.checks import check_integers, check_number
 from mpcoffline.learning.progress import Metrics, Report
+from mpcoffline.mpc import MPC
 from mpcoffline.policy import MPCPolicy
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ class LearnerConfig:
     value: ValueConfig = field(default_factory=ValueConfig)
     fit: FitConfig = field(default_factory=FitConfig)
 
+    def __post_init__(self) -> None:
+        check_number("trim", self.trim, 0.0, 1.0)
+
 
 #: The published recipe: (VALUE) by Bellman residual, then (FIT); discount, horizon and terminal cost are the MPC's.
 PRESETS: dict[str, LearnerConfig] = {"paper": LearnerConfig()}
@@ -51,10 +55,12 @@ class OfflineMPCLearner:
     Two regressions on the data set D, with the stage cost L (= -reward), discount gamma and successor s+::
 
         (VALUE)  phi* = argmin E_D[ (L(s,a) + gamma V_phi(s+) - V_phi(s))^2 ]
-        (FIT)    th*  = argmin E_D[ (L(s,a) + gamma V_phi(s+) - gamma V_phi(f_th(s,a)) - Lhat_th(s,a))^2 ] + l2 |th - th_0|^2
+        (FIT)    th*  = argmin E_D[ (L(s,a) + gamma V_phi(s+) - gamma V_phi(f_th(s,a)) - Lhat_th(s,a))^2 ]
+                               + l2 |th - th_0|^2
 
-    By Theorem 1 of Gros & Zanon (doi:10.1109/TAC.2019.2913768) an MPC whose stage cost is Q*(s,a) - gamma V*(f(s,a)) and whose terminal cost is
-    V* gives the optimal policy even when its model f is wrong; (FIT) looks for that stage cost.
+    By Theorem 1 of Gros & Zanon (doi:10.1109/TAC.2019.2913768) an MPC whose stage cost is Q*(s,a) - gamma V*(f(s,a))
+    and whose terminal cost is V* gives the optimal policy even when its model f is wrong; (FIT) looks for that stage
+    cost.
 
     Example:
         >>> mpc = nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0)
@@ -70,8 +76,8 @@ class OfflineMPCLearner:
         value: ``"residual"``, ``"td"`` or ``"expectile"``; overrides the preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
         device: Torch device for (VALUE).
-        **overrides: Any field of :class:`LearnerConfig`, :class:`ValueConfig` or :class:`FitConfig`, e.g. ``prior=1e-2`` or
-            ``tau=0.1``; names that both have take a prefix (``value_n_steps``, ``fit_n_steps``).
+        **overrides: Any field of :class:`LearnerConfig`, :class:`ValueConfig` or :class:`FitConfig`, e.g.
+            ``prior=1e-2`` or ``tau=0.1``; names that both have take a prefix (``value_n_steps``, ``fit_n_steps``).
 
     Raises:
         UnknownIdError: For an unknown preset, value method or override.
@@ -96,9 +102,14 @@ class OfflineMPCLearner:
             raise UnknownIdError.of("preset", preset, PRESETS)
         if value is not None:
             overrides["method"] = value
+        check_integers(0, seed=seed)
+        if value_function is not None and value_function.ny != mpc.nx:
+            raise InvalidArgumentError(
+                "value_function", expected=f"a function of {mpc.nx} coordinates", actual=str(value_function.ny)
+            )
         self.config = _overridden(PRESETS[preset], overrides)
         self.nominal_mpc, self.learn, self.preset, self.seed, self.device = mpc, learn, preset, int(seed), device
-        self.value_function = value_function
+        self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
         self.history: History = []
         self._observation_space: spaces.Box | None = None
@@ -112,7 +123,8 @@ class OfflineMPCLearner:
             show_progress: Whether to draw a progress bar.
 
         Returns:
-            ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with ``fit_loss``.
+            ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
+            ``fit_loss``.
 
         Raises:
             InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
@@ -124,8 +136,9 @@ class OfflineMPCLearner:
         table = table.trim(self.config.trim)
         history: History = []
         with _Progress(show_progress) as progress:
-            if self.value_function is None:
-                self.value_function = fit_value(
+            value_function = self._given_value_function
+            if value_function is None:
+                value_function = fit_value(
                     table,
                     mpc.discount,
                     self.config.value,
@@ -133,15 +146,16 @@ class OfflineMPCLearner:
                     device=self.device,
                     report=progress.phase("(VALUE) learning V", history),
                 ).cpu()
-            self.result = fit_parameters(
+            result = fit_parameters(
                 mpc,
-                self.value_function,
+                value_function,
                 table,
                 _GROUPS[self.learn],
                 self.config.fit,
                 seed=self.seed,
                 report=progress.phase(f"(FIT) learning {self.learn}", history),
             )
+        self.value_function, self.result = value_function, result
         self.history, self._observation_space, self._policy = history, observation_space, None
         return history
 
@@ -188,7 +202,7 @@ class OfflineMPCLearner:
         return TransitionTable.from_minari(dataset), space if isinstance(space, spaces.Box) else None
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes nominal and learned MPC, value function, configuration and history to a zip (JSON and npz, no pickle)."""
+        """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz."""
         document = {
             "mpc": self.nominal_mpc.to_json(),
             "learn": self.learn,
@@ -224,13 +238,16 @@ class OfflineMPCLearner:
                 learner.result = FitResult(theta, **document["result"])
             if document["observation_space"] is not None:
                 learner._observation_space = box_from_json(document["observation_space"])
-            learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False) if arrays else None
+            if arrays:
+                learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
+                if learner.value_function.ny != learner.nominal_mpc.nx:
+                    raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
         return learner
 
 
 def _overridden(config: LearnerConfig, overrides: dict[str, Any]) -> LearnerConfig:
     """The configuration with fields replaced by name; a name that both parts have needs its prefix."""
-    parts = {"value": config.value, "fit": config.fit}
+    parts: dict[str, ValueConfig | FitConfig] = {"value": config.value, "fit": config.fit}
     own = {f.name for part in parts.values() for f in fields(part)}
     shared = {f.name for f in fields(config.value)} & {f.name for f in fields(config.fit)}
     accepted: dict[str, tuple[str, str]] = {}

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers import Plan, Solution, Solver, make_solver
+from mpcoffline.solvers import SOLVERS, Plan, Solution, Solver, make_solver
 
 logger = logging.getLogger(__name__)
 
@@ -42,8 +42,8 @@ class MPCPolicy(BasePolicy):
     """The policy pi_theta(s) = u_0* of (MPC) with the interface of an SB3 policy.
 
     ``predict`` solves one MPC an observation. The warm start travels in SB3's recurrent ``state``, so that nothing is
-    hidden in the policy: ``state=None`` is a cold, deterministic solve. A solve that fails does not raise in the control
-    loop: the policy applies the next input of the previous plan (or zero, within bounds), counts it in
+    hidden in the policy: ``state=None`` is a cold, deterministic solve. A solve that fails does not raise in the
+    control loop: the policy applies the next input of the previous plan (or zero, within bounds), counts it in
     :attr:`solver_stats`, and logs a warning the first time.
 
     Args:
@@ -56,6 +56,10 @@ class MPCPolicy(BasePolicy):
     Attributes:
         mpc: The MPC.
         solver_stats: Counts since construction.
+
+    Raises:
+        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs.
+        UnknownIdError: For an unknown solver.
     """
 
     def __init__(
@@ -78,6 +82,8 @@ class MPCPolicy(BasePolicy):
         ):
             if space.shape != (size,):
                 raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
+        if solver != "auto" and solver not in SOLVERS:
+            raise UnknownIdError.of("solver", solver, ["auto", *SOLVERS])
         super().__init__(observation_space, action_space)
         self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
         self.solver_stats = SolverStats()
@@ -106,8 +112,8 @@ class MPCPolicy(BasePolicy):
             deterministic: Accepted for SB3; the policy is always deterministic.
 
         Returns:
-            Actions ``(nu,)`` or ``(B, nu)`` within the bounds and in the dtype of the action space, and the state: the plan
-            shifted by one step.
+            Actions ``(nu,)`` or ``(B, nu)`` within the bounds and in the dtype of the action space, and the state: the
+            plan shifted by one step.
 
         Raises:
             InvalidArgumentError: For an observation of the wrong shape or with NaN, or a state of another batch size.
@@ -120,8 +126,13 @@ class MPCPolicy(BasePolicy):
         actions = np.clip(inputs.astype(space.dtype), space.low, space.high)
         return (actions[0] if np.ndim(observation) == 1 else actions), plan
 
-    def _predict(self, observation: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
-        """A cold solve of a batch of observations, as SB3's ``forward`` of a policy; no gradients."""
+    def forward(self, observation: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
+        """Actions ``(B, nu)`` of a tensor of observations ``(B, nx)``, by cold solves; without gradients."""
+        return self._predict(observation, deterministic)
+
+    def _predict(self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = True) -> torch.Tensor:
+        if isinstance(observation, dict):
+            raise InvalidArgumentError("observation", expected="a tensor", actual="a dictionary")
         actions, _ = self.predict(observation.detach().cpu().numpy(), deterministic=deterministic)
         return torch.as_tensor(actions, device=observation.device)
 
@@ -191,7 +202,7 @@ class MPCPolicy(BasePolicy):
         write_archive(path, "policy", document)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], device: torch.device | str = "auto") -> Self:  # type: ignore[override]
+    def load(cls, path: str | PathLike[str], device: torch.device | str = "auto") -> Self:
         """Reads what :meth:`save` wrote.
 
         Args:

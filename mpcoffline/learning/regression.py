@@ -15,10 +15,13 @@ from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
+from .checks import check_integers, check_number
 from .progress import Report, silent
 from .value import ValueFunction, cosine
 
 Array = NDArray[np.float64]
+
+_OFF_SADDLE = 0.1  # in scaled coordinates
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,8 @@ class FitConfig:
     """How theta is learned.
 
     Attributes:
-        prior: l2, the weight of |z - z_0|^2, where z are the scaled coordinates of :class:`Coordinates` and the regression
-            error is measured in units of the cost's variance.
+        prior: l2, the weight of |z - z_0|^2, where z are the scaled coordinates of :class:`Coordinates` and the
+            regression error is measured in units of the cost's variance.
         n_steps: Gradient steps on cost and model together (none where the model is fixed).
         batch_size: Transitions a step.
         learning_rate: Adam's at the start, in scaled coordinates; falls to zero on a cosine.
@@ -45,11 +48,11 @@ class FitConfig:
     refit_iterations: int = 300
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.prior) and self.prior >= 0.0):
-            raise InvalidArgumentError("prior", expected="a number >= 0", actual=str(self.prior))
-        for name in ("n_steps", "batch_size", "refit_rows", "refit_iterations"):
-            if getattr(self, name) < 1:
-                raise InvalidArgumentError(name, expected="a positive integer", actual=str(getattr(self, name)))
+        check_number("prior", self.prior, 0.0, open_low=False)
+        for name in ("learning_rate", "clip"):
+            check_number(name, getattr(self, name), 0.0)
+        counts = ("n_steps", "batch_size", "refit_rows", "refit_iterations")
+        check_integers(1, **{name: getattr(self, name) for name in counts})
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class Coordinates:
 
     A parameter with a positive lower bound (a mass, a length) is learned by its logarithm; the entries of a row of a
     matrix factor are measured in the size of that row, other numbers in the size of their block. Bounds on theta
-    become bounds on z.
+    become bounds on z. The factor C of a matrix C C' is free here: the sign of a column means nothing, and a diagonal
+    held at zero would block the way to the same matrix with the column reversed; :func:`canonical` restores the signs.
 
     Args:
         mpc: The MPC; its parameters are theta_0, and z = 0 there.
@@ -83,6 +87,9 @@ class Coordinates:
         space = mpc.space
         self.mask = space.mask(groups)
         theta, low, high = (v[self.mask] for v in (space.theta, space.low, space.high))
+        factor = np.concatenate([np.full(block.size, block.kind == "psd") for block in space])[self.mask]
+        self._stuck = factor & (low == 0.0) & (theta == 0.0)
+        low = np.where(factor, -np.inf, low)
         self.logarithmic = (low > 0.0) & (theta > 0.0)
         scale = np.concatenate([_block_scale(block.theta, block.kind) for block in space])[self.mask]
         self.scale = np.where(self.logarithmic, 1.0, scale)
@@ -98,6 +105,14 @@ class Coordinates:
         """Number of learned coordinates."""
         return int(self.mask.sum())
 
+    @property
+    def start(self) -> Array:
+        """Where a descent begins, ``(size,)``: z = 0, but for the zeros on the diagonal of a factor C.
+
+        With a zero column C is a saddle of any loss in C C', which a descent would never leave.
+        """
+        return np.where(self._stuck, _OFF_SADDLE, 0.0)
+
     def theta(self, z: Tensor) -> Tensor:
         """The full theta ``(size,)`` of z, differentiable in z."""
         theta_0, scale = torch.from_numpy(self._theta_0), torch.from_numpy(self.scale)
@@ -109,7 +124,7 @@ class Coordinates:
 
 
 def _block_scale(theta: Array, kind: str) -> Array:
-    """The size of each coordinate of a block: of its row for a matrix factor, of the block's largest entry otherwise."""
+    """The size of each coordinate of a block: its row's for a matrix factor, otherwise the block's largest entry."""
     if kind != "psd":
         return np.full(len(theta), float(np.abs(theta).max(initial=0.0)) or 1.0)
     n = round((np.sqrt(8 * len(theta) + 1) - 1) / 2)
@@ -143,17 +158,20 @@ class BellmanFit:
     def target(self, batch: Columns) -> Tensor:
         """L(s,a) + gamma V(s+), ``(B,)``: what does not depend on theta."""
         alive = 1.0 - batch.terminations.double()
-        return batch.costs.double() + self._discount * alive * self._value(batch.next_observations).double()
+        target: Tensor = batch.costs.double() + self._discount * alive * self._value(batch.next_observations).double()
+        return target
 
     def predicted_value(self, batch: Columns, theta: Tensor) -> Tensor:
-        """gamma V(f_th(s,a)), ``(B,)``."""
+        """The discounted value of the predicted successor, gamma V(f_th(s,a)), ``(B,)``."""
         reached = self._f(batch.observations.double(), batch.actions.double(), theta)
         alive = 1.0 - batch.terminations.double()
-        return self._discount * alive * self._value(reached.float()).double()
+        value: Tensor = self._discount * alive * self._value(reached.float()).double()
+        return value
 
     def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:
         """Lhat_th(s,a), ``(B,)``."""
-        return self._stage(batch.observations.double(), batch.actions.double(), theta).squeeze(-1)
+        cost: Tensor = self._stage(batch.observations.double(), batch.actions.double(), theta)
+        return cost.squeeze(-1)
 
     def error(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean squared error over a minibatch, a scalar."""
@@ -193,6 +211,9 @@ def fit_parameters(
 
     Returns:
         The parameters and the errors before and after.
+
+    Raises:
+        InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
     """
     rng = np.random.default_rng(seed)
     unit = float(table.costs.var(dtype=np.float64)) or 1.0
@@ -202,6 +223,13 @@ def fit_parameters(
     theta = mpc.theta
     with torch.no_grad():
         before = float(problem.error(sample, torch.from_numpy(theta)))
+    if not np.isfinite(before):
+        raise InvalidArgumentError(
+            "mpc",
+            expected="a model and a cost that are finite on the data",
+            actual=f"a regression error of {before}",
+            hint="Evaluate mpc.dynamics_function and mpc.stage_function at the logged states and actions.",
+        )
     n_steps = config.n_steps if "model" in groups else 0
     total = n_steps + config.refit_iterations
     if n_steps:
@@ -225,7 +253,7 @@ def _gradient_steps(
     """Adam on (FIT) over all learned coordinates, projected onto their bounds after each step."""
     coordinates = Coordinates(mpc, groups)
     low, high = torch.from_numpy(coordinates.low), torch.from_numpy(coordinates.high)
-    z = torch.zeros(coordinates.size, dtype=torch.float64, requires_grad=True)
+    z = torch.from_numpy(coordinates.start).requires_grad_()
     optimiser = torch.optim.Adam([z], lr=config.learning_rate)
     batches = table.batches(config.batch_size, rng)
     losses: list[float] = []
@@ -234,15 +262,16 @@ def _gradient_steps(
         error = problem.error(table.columns(next(batches)), coordinates.theta(z))
         optimiser.zero_grad()
         (error + config.prior * z.square().sum()).backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_([z], config.clip)
-        optimiser.step()
-        with torch.no_grad():
-            z.clamp_(low, high)
-        losses.append(float(error.detach()))
+        norm = torch.nn.utils.clip_grad_norm_([z], config.clip)
+        if torch.isfinite(norm):  # one NaN would stay in Adam's moments for ever
+            optimiser.step()
+            with torch.no_grad():
+                z.clamp_(low, high)
+            losses.append(float(error.detach()))
         if step % epoch == 0 or step == config.n_steps:
-            report(step, total, {"fit_loss": float(np.mean(losses))})
+            report(step, total, {"fit_loss": float(np.mean(losses)) if losses else np.nan})
             losses.clear()
-    return _within_bounds(mpc, coordinates.theta(z.detach()).numpy())
+    return canonical(mpc, coordinates.theta(z.detach()).numpy())
 
 
 def _refit_cost(mpc: MPC, theta: Array, problem: BellmanFit, sample: Columns, config: FitConfig) -> tuple[Array, float]:
@@ -265,18 +294,25 @@ def _refit_cost(mpc: MPC, theta: Array, problem: BellmanFit, sample: Columns, co
 
     found = scipy.optimize.minimize(
         objective,
-        np.zeros(start.size),
+        start.start,
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(start.low, start.high, strict=True)),
         options={"maxiter": config.refit_iterations},
     )
-    fitted = _within_bounds(mpc, start.theta(torch.from_numpy(found.x)).numpy())
+    fitted = canonical(mpc, start.theta(torch.from_numpy(found.x)).numpy())
     with torch.no_grad():
         error = problem.mean_square(target - problem.stage_cost(sample, torch.from_numpy(fitted)))
     return fitted, float(error)
 
 
-def _within_bounds(mpc: MPC, theta: Array) -> Array:
-    """Theta with rounding beyond the bounds removed."""
-    return np.clip(theta, mpc.space.low, mpc.space.high)
+def canonical(mpc: MPC, theta: Array) -> Array:
+    """The same parameters with matrix factors of non-negative diagonal, and rounding beyond the bounds removed."""
+    result = theta.copy()
+    for block in mpc.space:
+        if block.kind == "psd":
+            rows, columns = np.tril_indices(block.shape[0])
+            part = mpc.space.slices[block.name]
+            signs = np.where(theta[part][rows == columns] < 0.0, -1.0, 1.0)
+            result[part] = theta[part] * signs[columns]
+    return np.clip(result, mpc.space.low, mpc.space.high)

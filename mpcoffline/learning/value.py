@@ -1,4 +1,4 @@
-"""(VALUE): a value function V_phi of the logged data, by regression (arXiv:2301.01667, section on the value function)."""
+"""(VALUE): a value function V_phi of the logged data, by regression (arXiv:2301.01667)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,14 @@ from torch import Tensor, nn
 from mpcoffline.datasets.transitions import Columns, TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 
+from .checks import check_integers, check_number
 from .progress import Report, silent
 
 
 class ValueFunction(nn.Module):
-    """V_phi: a fully connected network on normalised observations::
+    """V_phi: a fully connected network on normalised observations.
+
+    ::
 
         V_phi(s) = offset + scale * net((s - mean) / std)
 
@@ -61,7 +64,8 @@ class ValueFunction(nn.Module):
     def forward(self, observations: Tensor) -> Tensor:
         """V_phi of observations ``(..., ny)``, shape ``(...)``."""
         normalised = (observations - self.mean) / self.std
-        return self.offset + self.scale * self.net(normalised).squeeze(-1)
+        shape: Tensor = self.net(normalised).squeeze(-1)
+        return self.offset + self.scale * shape
 
     def predict(self, observations: ArrayLike) -> NDArray[np.float64]:
         """V_phi of numpy observations ``(..., ny)``, shape ``(...)`` in float64.
@@ -75,7 +79,8 @@ class ValueFunction(nn.Module):
                 "observations", expected=f"finite numbers of shape (..., {self.ny})", actual=f"shape {array.shape}"
             )
         with torch.no_grad():
-            return self(torch.from_numpy(array).to(self.mean.device)).double().cpu().numpy()
+            values: Tensor = self(torch.from_numpy(array).to(self.mean.device))
+        return np.asarray(values.cpu().numpy(), dtype=np.float64)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All weights and normalisation constants as numpy arrays, by name."""
@@ -115,7 +120,9 @@ class ValueMethod(ABC):
 
 @dataclass(frozen=True)
 class Residual(ValueMethod):
-    """(VALUE) as published: the squared Bellman residual, differentiated on both sides::
+    """(VALUE) as published: the squared Bellman residual, differentiated on both sides.
+
+    ::
 
         E_D[ (L(s,a) + gamma V_phi(s+) - V_phi(s))^2 ]
 
@@ -125,12 +132,15 @@ class Residual(ValueMethod):
     def loss(self, V: ValueFunction, V_target: ValueFunction, batch: Columns, discount: float) -> Tensor:
         """See :class:`ValueMethod`."""
         bootstrap = discount * (1.0 - batch.terminations) * V(batch.next_observations)
-        return (batch.costs + bootstrap - V(batch.observations)).square().mean()
+        residual: Tensor = batch.costs + bootstrap - V(batch.observations)
+        return residual.square().mean()
 
 
 @dataclass(frozen=True)
 class TemporalDifference(ValueMethod):
-    """Semi-gradient TD(0) with a target network: the target is held constant::
+    """Semi-gradient TD(0) with a target network: the target is held constant.
+
+    ::
 
         E_D[ (L(s,a) + gamma V_target(s+) - V_phi(s))^2 ]
 
@@ -146,16 +156,20 @@ class TemporalDifference(ValueMethod):
         """Target minus prediction, ``(B,)``."""
         with torch.no_grad():
             target = batch.costs + discount * (1.0 - batch.terminations) * V_target(batch.next_observations)
-        return target - V(batch.observations)
+        delta: Tensor = target - V(batch.observations)
+        return delta
 
 
 @dataclass(frozen=True)
 class Expectile(ValueMethod):
-    """A low expectile of the sampled target: towards the best action in the data instead of the average one::
+    """A low expectile of the sampled target: towards the best action in the data instead of the average one.
+
+    ::
 
         E_D[ |tau - 1(delta < 0)| delta^2 ],      delta = L(s,a) + gamma V_target(s+) - V_phi(s),   tau < 1/2
 
-    After implicit Q-learning (Kostrikov et al., arXiv:2110.06169) with the sign of costs. Optimistic where the plant is noisy.
+    After implicit Q-learning (Kostrikov et al., arXiv:2110.06169) with the sign of costs. Optimistic where the plant is
+    noisy.
 
     Args:
         tau: The expectile: the weight of targets above V; those below weigh 1 - tau.
@@ -193,16 +207,17 @@ class ValueConfig:
     batch_size: int = 256
     learning_rate: float = 1e-3
     polyak: float = 0.01
-    hidden: tuple[int, ...] = field(default=(256, 256))
+    hidden: tuple[int, ...] = (256, 256)
 
     def __post_init__(self) -> None:
         if self.method not in VALUE_METHODS:
             raise UnknownIdError.of("value method", self.method, VALUE_METHODS)
         if not 0.0 < self.tau < 1.0:
             raise InvalidArgumentError("tau", expected="a number in (0, 1)", actual=str(self.tau))
-        for name in ("n_steps", "batch_size"):
-            if getattr(self, name) < 1:
-                raise InvalidArgumentError(name, expected="a positive integer", actual=str(getattr(self, name)))
+        check_integers(1, n_steps=self.n_steps, batch_size=self.batch_size)
+        check_integers(1, **{f"hidden[{i}]": width for i, width in enumerate(self.hidden)})
+        check_number("learning_rate", self.learning_rate, 0.0)
+        check_number("polyak", self.polyak, 0.0, 1.0)
 
     def build(self) -> ValueMethod:
         """The loss."""
