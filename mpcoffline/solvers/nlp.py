@@ -12,10 +12,9 @@ from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, Plan, Solution, Solver
+from .starts import N_CANDIDATES, candidate_inputs
 
 _FEASIBILITY_TOLERANCE = 1e-6
-_N_CANDIDATES = 64
-_SEGMENT = 5  # steps for which a random input sequence holds its value
 _CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -40,8 +39,8 @@ class IpoptSolver(Solver):
         self, mpc: MPC, *, n_starts: int | None = None, tolerance: float = 1e-8, max_iterations: int = 300
     ) -> None:
         super().__init__(mpc)
-        if n_starts is not None and not 1 <= n_starts <= _N_CANDIDATES:
-            raise InvalidArgumentError("n_starts", expected=f"from 1 to {_N_CANDIDATES}", actual=str(n_starts))
+        if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
+            raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
         self._n_starts = n_starts or (1 if is_linear(mpc) else 4)
         nlp = _nonlinear_program(mpc)
         common = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
@@ -51,7 +50,7 @@ class IpoptSolver(Solver):
         self._exact = _ipopt("exact", nlp, common | warm, {})
         self._n_constraints = nlp["g"].numel() // mpc.horizon - mpc.nx
         self._rollout = _rollout_function(mpc)
-        self._candidates = _random_inputs(mpc, _N_CANDIDATES)
+        self._candidates = candidate_inputs(mpc)
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
         start = time.perf_counter()
@@ -212,16 +211,4 @@ def _rollout_function(mpc: MPC) -> ca.Function:
     last = path[:, -1]
     cost = last[mpc.nx] + last[mpc.nx + 1] * mpc.terminal_function(last[: mpc.nx], p)
     one = ca.Function("one", [s, inputs, p], [path[: mpc.nx, :], cost])
-    return one.map("all", "serial", _N_CANDIDATES, [0, 2], [])
-
-
-def _random_inputs(mpc: MPC, n: int) -> Array:
-    """Candidate input sequences ``(n, N, nu)``: zero, then piecewise-constant random ones within the bounds."""
-    rng = np.random.default_rng(0)
-    low = np.where(np.isfinite(np.asarray(mpc.action_low)), np.asarray(mpc.action_low), -1.0)
-    high = np.where(np.isfinite(np.asarray(mpc.action_high)), np.asarray(mpc.action_high), 1.0)
-    segments = -(-mpc.horizon // _SEGMENT)
-    values = rng.uniform(low, high, size=(n, segments, mpc.nu))
-    inputs = np.repeat(values, _SEGMENT, axis=1)[:, : mpc.horizon].copy()
-    inputs[0] = np.clip(0.0, low, high)
-    return inputs
+    return one.map("all", "serial", N_CANDIDATES, [0, 2], [])

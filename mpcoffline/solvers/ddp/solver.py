@@ -1,0 +1,207 @@
+"""DDPSolver: batches of MPCs in generated, vectorised C."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from concurrent.futures import ThreadPoolExecutor
+from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.mpc import MPC
+from mpcoffline.solvers.interface import Array, Plan, Solution, Solver
+from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
+
+from .build import compiled
+from .codegen import source
+
+_STATUS = ("converged", "iteration limit", "stalled", "not finite")
+_LANES = 8
+
+
+class _Problem(ctypes.Structure):
+    """``mpc_problem`` of the kernel."""
+
+    _fields_ = (
+        ("horizon", c_int64),
+        ("discount", c_double),
+        ("low", c_void_p),
+        ("high", c_void_p),
+        ("max_iterations", c_int64),
+        ("tolerance", c_double),
+    )
+
+
+class _Batch(ctypes.Structure):
+    """``mpc_batch`` of the kernel."""
+
+    _fields_ = (
+        ("n", c_int64),
+        ("x0", c_void_p),
+        ("theta", c_void_p),
+        ("u0", c_void_p),
+        ("x", c_void_p),
+        ("u", c_void_p),
+        ("J", c_void_p),
+        ("predicted", c_void_p),
+        ("iterations", c_void_p),
+        ("status", c_void_p),
+        ("cold", c_int),
+    )
+
+
+class DDPSolver(Solver):
+    """Control-limited differential dynamic programming with Gauss-Newton Hessians, eight problems an instruction.
+
+    Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
+    and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. A cold
+        tolerance: Predicted decrease of the cost, relative to 1 + |V|, below which a problem counts as solved.
+    its plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
+    ``success`` says that the quadratic model at it promises no further decrease.
+
+    References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
+
+    Args:
+        mpc: The problem; without constraints other than input bounds.
+        max_iterations: Bound on the iterations of a problem.
+        tolerance: Predicted decrease of the cost, relative to 1 + |V|, below which a problem is solved.
+        n_starts: Starting points of a cold solve.
+        n_threads: Threads that share a batch; a batch of up to eight problems uses one.
+
+    Raises:
+        InvalidArgumentError: For an MPC with constraints, or functions without a counterpart in C.
+        CompilerError: If there is no working C compiler.
+    """
+
+    name = "ddp"
+
+    def __init__(
+        self,
+        mpc: MPC,
+        *,
+        max_iterations: int = 200,
+        tolerance: float = 1e-9,
+        n_starts: int = _LANES,
+        n_threads: int = 1,
+    ) -> None:
+        super().__init__(mpc)
+        if mpc.constraints is not None:
+            raise InvalidArgumentError(
+                "constraints",
+                expected="none but input bounds for the ddp solver",
+                actual="constraints",
+                hint="Use ipopt.",
+            )
+        for name, value in (("max_iterations", max_iterations), ("n_threads", n_threads)):
+            if value < 1:
+                raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
+        if not 1 <= n_starts <= N_CANDIDATES:
+            raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
+        library = compiled(source(mpc))
+        problem, batch = POINTER(_Problem), POINTER(_Batch)
+        library.mpc_solve.argtypes = (problem, batch, c_int64, c_int64)
+        library.mpc_solve_cold.argtypes = (problem, batch, c_void_p, c_int64, c_int64, c_int64, c_int64)
+        self._library = library
+        self._low, self._high = (np.ascontiguousarray(b, dtype=np.float64) for b in (mpc.action_low, mpc.action_high))
+        self._problem = _Problem(
+            mpc.horizon, mpc.discount, self._low.ctypes.data, self._high.ctypes.data, max_iterations, tolerance
+        )
+        self._candidates = np.ascontiguousarray(candidate_inputs(mpc))
+        self._n_starts, self._n_threads = n_starts, n_threads
+
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
+        start = time.perf_counter()
+        known = warm_start.known
+        if known.all():
+            result = self._run(x, theta, u0, warm_start)
+        elif not known.any():
+            result = self._run(x, theta, u0, None)
+        else:
+            result = self._run_mixed(x, theta, u0, warm_start, known)
+        # A warm start can lead nowhere; such a problem gets the cold solve that it would have had without.
+        lost = known & (result["status"] > 1)
+        if lost.any():
+            again = self._run(x[lost], theta, None if u0 is None else u0[lost], None)
+            for name, array in again.items():
+                result[name][lost] = array
+        status = result["status"]
+        stats: dict[str, Any] = {"iterations": result["iterations"], "time": time.perf_counter() - start}
+        stats["predicted_decrease"] = result["predicted"]
+        success = (status == 0) & np.isfinite(result["J"])
+        words = [_STATUS[code] for code in status]
+        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], success, words, stats)
+
+    def _run_mixed(
+        self, x: Array, theta: Array, u0: Array | None, plan: Plan, known: NDArray[np.bool_]
+    ) -> dict[str, NDArray[Any]]:
+        """Warm and cold problems of one batch, solved apart and put together in order."""
+        merged: dict[str, NDArray[Any]] = {}
+        for chosen, warm in ((known, Plan(plan.x[known], plan.u[known])), (~known, None)):
+            part = self._run(x[chosen], theta, None if u0 is None else u0[chosen], warm)
+            for name, array in part.items():
+                merged.setdefault(name, np.empty((len(x), *array.shape[1:]), array.dtype))[chosen] = array
+        return merged
+
+    def _run(self, x: Array, theta: Array, u0: Array | None, plan: Plan | None) -> dict[str, NDArray[Any]]:
+        """Calls the kernel; warm with a plan, cold without."""
+        n, mpc = len(x), self.mpc
+        states = np.ascontiguousarray(x)
+        parameters = np.ascontiguousarray(np.broadcast_to(theta, (n, len(theta))))
+        imposed = None if u0 is None else np.ascontiguousarray(u0)
+        if plan is None:
+            trajectories = np.empty((n, mpc.horizon + 1, mpc.nx))
+            inputs = np.empty((n, mpc.horizon, mpc.nu))
+        else:
+            trajectories, inputs = (np.array(part, dtype=np.float64, order="C") for part in plan)
+        J, predicted = np.empty(n), np.empty(n)
+        iterations, status = np.empty(n, np.int64), np.empty(n, np.int64)
+        batch = _Batch(
+            n,
+            states.ctypes.data,
+            parameters.ctypes.data,
+            None if imposed is None else imposed.ctypes.data,
+            trajectories.ctypes.data,
+            inputs.ctypes.data,
+            J.ctypes.data,
+            predicted.ctypes.data,
+            iterations.ctypes.data,
+            status.ctypes.data,
+            0,
+        )
+        workers = min(self._n_threads, -(-n // _LANES) if plan is not None else n)
+
+        def work(first: int) -> int:
+            problem = ctypes.byref(self._problem)
+            if plan is not None:
+                return int(self._library.mpc_solve(problem, ctypes.byref(batch), first, workers))
+            return int(
+                self._library.mpc_solve_cold(
+                    problem,
+                    ctypes.byref(batch),
+                    self._candidates.ctypes.data,
+                    len(self._candidates),
+                    self._n_starts,
+                    first,
+                    workers,
+                )
+            )
+
+        if workers == 1:
+            failed = work(0)
+        else:
+            with ThreadPoolExecutor(workers) as pool:  # ctypes releases the interpreter lock
+                failed = sum(pool.map(work, range(workers)))
+        if failed:
+            raise MemoryError(f"solving {n} MPCs: the kernel could not allocate its work space")
+        return {
+            "x": trajectories,
+            "u": inputs,
+            "J": J,
+            "predicted": predicted,
+            "iterations": iterations,
+            "status": status,
+        }

@@ -1,0 +1,32 @@
+/* LANES doubles that share an instruction: GCC and Clang vector extensions, in plain C. */
+#include <math.h>
+
+#define LANES 8
+typedef double vd __attribute__((vector_size(8 * LANES)));
+typedef long long vl __attribute__((vector_size(8 * LANES)));
+
+static inline vd V(double a) { return (vd){a, a, a, a, a, a, a, a}; }
+static inline vd vd_select(vl mask, vd a, vd b) { return (vd)((mask & (vl)a) | (~mask & (vl)b)); }
+static inline vl vd_lt(vd a, vd b) { return a < b; }
+static inline vl vd_le(vd a, vd b) { return a <= b; }
+static inline vd vd_min(vd a, vd b) { return vd_select(a < b, a, b); }
+static inline vd vd_max(vd a, vd b) { return vd_select(a > b, a, b); }
+static inline vd vd_abs(vd a) { return vd_select(a < 0.0, -a, a); }
+static inline int vl_any(vl mask) {
+    long long any = 0;
+    for (int l = 0; l < LANES; ++l) any |= mask[l];
+    return any != 0;
+}
+static inline vd vd_bool(vl mask) { return vd_select(mask, V(1.0), V(0.0)); }
+
+#define LANEWISE(name, call) \
+    static inline vd name(vd a) { vd r; for (int l = 0; l < LANES; ++l) r[l] = call(a[l]); return r; }
+#define LANEWISE2(name, call) \
+    static inline vd name(vd a, vd b) { vd r; for (int l = 0; l < LANES; ++l) r[l] = call(a[l], b[l]); return r; }
+
+LANEWISE(vd_sqrt, sqrt) LANEWISE(vd_exp, exp) LANEWISE(vd_log, log) LANEWISE(vd_log1p, log1p) LANEWISE(vd_expm1, expm1)
+LANEWISE(vd_sin, sin) LANEWISE(vd_cos, cos) LANEWISE(vd_tan, tan) LANEWISE(vd_asin, asin) LANEWISE(vd_acos, acos)
+LANEWISE(vd_atan, atan) LANEWISE(vd_sinh, sinh) LANEWISE(vd_cosh, cosh) LANEWISE(vd_tanh, tanh) LANEWISE(vd_asinh, asinh)
+LANEWISE(vd_acosh, acosh) LANEWISE(vd_atanh, atanh) LANEWISE(vd_floor, floor) LANEWISE(vd_ceil, ceil) LANEWISE(vd_erf, erf)
+LANEWISE2(vd_pow, pow) LANEWISE2(vd_atan2, atan2) LANEWISE2(vd_hypot, hypot) LANEWISE2(vd_fmod, fmod)
+LANEWISE2(vd_copysign, copysign)
