@@ -46,38 +46,94 @@ _FORMATS = {
 def source(mpc: MPC) -> str:
     """The complete C source for an MPC; horizon, discount, bounds and theta are arguments of the compiled functions.
 
+    What depends on theta alone is computed once a problem, in ``gen_prepare``; the products of the Riccati recursion are
+    generated too, so that zeros in the model's derivatives cost nothing.
+
     Raises:
         InvalidArgumentError: If a function of the MPC cannot be expanded to SX or has no counterpart in C.
     """
-    x, u = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu)
-    p = ca.SX.sym("p", mpc.space.size)
-    reached, cost = mpc.dynamics_function(x, u, p), mpc.stage_function(x, u, p)
-    final = mpc.terminal_function(x, p)
-    lxx, lx = ca.hessian(cost, x)
-    luu, lu = ca.hessian(cost, u)
-    lux = ca.jacobian(lu, x)
-    txx, tx = ca.hessian(final, x)
-    fx, fu = ca.jacobian(reached, x), ca.jacobian(reached, u)
+    x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
+    following, gradient = ca.SX.sym("following", mpc.nx), ca.SX.sym("Vx", mpc.nx)
+    curvature, discount = ca.SX.sym("Vxx", mpc.nx, mpc.nx), ca.SX.sym("discount")
+    reached, cost = mpc.dynamics_function(x, u, theta), mpc.stage_function(x, u, theta)
+    final = mpc.terminal_function(x, theta)
+    final_hessian, final_gradient = ca.hessian(final, x)
+    inputs = {
+        "gen_step": [x, u],
+        "gen_final": [x],
+        "gen_final_expand": [x],
+        "gen_q": [x, u, following, gradient, ca.vec(curvature), discount],
+    }
+    outputs = {
+        "gen_step": _stacked(reached, cost),
+        "gen_final": _stacked(final),
+        "gen_final_expand": _stacked(final_gradient, final_hessian),
+        "gen_q": _action_value(reached, cost, x, u, following, gradient, curvature, discount),
+    }
+    bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
+    parameters = ca.vertcat(theta, symbols)
     parts = [
-        f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}",
+        f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
         _text("vector.h"),
-        emit("gen_step", [x, u, p], [reached, cost]),
-        emit("gen_expand", [x, u, p], [reached, fx, fu, lx, lu, lxx, lux, luu]),
-        emit("gen_final", [x, p], [final]),
-        emit("gen_final_expand", [x, p], [tx, txx]),
+        emit("gen_prepare", [theta], prepared),
+        *(emit(name, [*inputs[name], parameters], body) for name, body in zip(outputs, bodies, strict=True)),
         _text("kernel.c"),
     ]
     return "\n\n".join(parts)
 
 
-def emit(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> str:
-    """One C function ``name(i0, i1, ..., out)`` whose result is the outputs one behind the other, column-major.
+def _action_value(
+    reached: ca.SX,
+    cost: ca.SX,
+    x: ca.SX,
+    u: ca.SX,
+    following: ca.SX,
+    gradient: ca.SX,
+    curvature: ca.SX,
+    discount: ca.SX,
+) -> ca.SX:
+    """The quadratic model of Q(x, u) = L + gamma V(f(x, u)), V expanded at the successor that the trajectory names.
+
+    Gauss-Newton: the curvature of f is left out. In the order that the kernel expects: the defect, Qx, Qu, Qxx, Qux,
+    Quu, and the regularisation directions fu'fx, fu'fu.
+    """
+    fx, fu = ca.jacobian(reached, x), ca.jacobian(reached, u)
+    lxx, lx = ca.hessian(cost, x)
+    luu, lu = ca.hessian(cost, u)
+    defect = reached - following
+    slope = discount * (gradient + curvature @ defect)
+    weighted_fx, weighted_fu = discount * (curvature @ fx), discount * (curvature @ fu)
+    return _stacked(
+        defect,
+        lx + fx.T @ slope,
+        lu + fu.T @ slope,
+        lxx + fx.T @ weighted_fx,
+        ca.jacobian(lu, x) + fu.T @ weighted_fx,
+        luu + fu.T @ weighted_fu,
+        fu.T @ fx,
+        fu.T @ fu,
+    )
+
+
+def _hoisted(bodies: list[ca.SX], theta: ca.SX) -> tuple[list[ca.SX], ca.SX, ca.SX]:
+    """Takes out what depends on theta alone: the rest, the symbols that stand for it, and what they stand for."""
+    sizes = [0, *np.cumsum([body.numel() for body in bodies]).tolist()]
+    rest, symbols, prepared = ca.extract_parametric(ca.cse(ca.vertcat(*bodies)), theta)
+    return ca.vertsplit(rest, sizes), ca.vertcat(*symbols), ca.vertcat(*prepared)
+
+
+def _stacked(*parts: ca.SX) -> ca.SX:
+    """Matrices as one dense column, each column-major."""
+    return ca.vertcat(*(ca.vec(ca.densify(part)) for part in parts))
+
+
+def emit(name: str, inputs: list[ca.SX], output: ca.SX) -> str:
+    """One C function ``name(i0, i1, ..., out)`` of vectors of doubles.
 
     Raises:
         InvalidArgumentError: For an operation without a counterpart in C.
     """
-    stacked = ca.vertcat(*(ca.vec(ca.densify(output)) for output in outputs))
-    function = expanded(ca.Function(name, inputs, [stacked]))
+    function = expanded(ca.Function(name, inputs, [output]))
     arguments = ", ".join(f"const vd *i{k}" for k in range(len(inputs)))
     lines = [f"static void {name}({arguments}, vd *out) {{"]
     lines.append("    vd " + ", ".join(f"w{k}" for k in range(max(1, function.sz_w()))) + ";")

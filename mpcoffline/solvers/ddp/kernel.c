@@ -4,10 +4,12 @@
  * recursion (V_k = L + gamma V_{k+1}), so that late stages stay well scaled, and with defects in the first backward pass
  * (Giftthaler et al., arXiv:1711.11006), so that a warm start need not obey the model.
  *
- * Included after generated code that defines NX, NU, NP, the type vd of LANES doubles, and
- *   gen_step(x, u, p, out):     x+ [NX], L [1]
- *   gen_expand(x, u, p, out):   x+ [NX], fx [NX*NX], fu [NX*NU], lx [NX], lu [NU], lxx [NX*NX], lux [NU*NX], luu [NU*NU]
- *   gen_final(x, p, out):       T [1]
+ * Included after generated code that defines NX, NU, NP, NQ and the functions
+ *   gen_prepare(theta, out):   what depends on theta alone [NQ]; the others take p = (theta, that)
+ *   gen_step(x, u, p, out):    x+ [NX], L [1]
+ *   gen_q(x, u, x_next, Vx, Vxx, gamma, p, out):  f(x, u) - x_next [NX], Qx [NX], Qu [NU], Qxx [NX*NX], Qux [NU*NX],
+ *                              Quu [NU*NU], fu'fx [NU*NX], fu'fu [NU*NU]
+ *   gen_final(x, p, out):      T [1]
  *   gen_final_expand(x, p, out): Tx [NX], Txx [NX*NX]
  * with matrices column-major.
  */
@@ -34,7 +36,7 @@ typedef struct {
 typedef struct {
     vd *x, *u, *x_new, *u_new; /* (N+1, NX), (N, NU) */
     vd *k, *K;                 /* feedforward (N, NU), feedback (N, NU, NX) column-major */
-    vd p[NP + 1], s[NX], low0[NU], high0[NU];
+    vd p[NP + NQ + 1], s[NX], low0[NU], high0[NU];
     vd J, J_new, mu, predicted, defect;
     vl pd; /* lanes whose backward pass found a positive definite Quu */
 } lanes;
@@ -171,70 +173,27 @@ static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high
 
 /* Riccati recursion along (x, u): gains k, K, the predicted decrease of J, and where Quu was positive definite. */
 static void backward(const mpc_problem *m, lanes *w) {
-    vd Vx[NX], Vxx[NX][NX], out[NX + NX * NX + NX * NU + NX + NU + NX * NX + NU * NX + NU * NU];
+    vd Vx[NX], Vxx[NX * NX], out[NX + NX + NU + NX * NX + 2 * (NU * NX + NU * NU)];
     int64_t N = m->horizon;
     gen_final_expand(w->x + N * NX, w->p, out);
-    for (int i = 0; i < NX; ++i) {
-        Vx[i] = out[i];
-        for (int j = 0; j < NX; ++j) Vxx[i][j] = out[NX + j * NX + i];
-    }
+    for (int i = 0; i < NX; ++i) Vx[i] = out[i];
+    for (int i = 0; i < NX * NX; ++i) Vxx[i] = out[NX + i];
     double weight = 1.0;
     for (int64_t k = 1; k < N; ++k) weight *= m->discount;
-    vd g = V(m->discount);
+    vd discount = V(m->discount);
     w->pd = all_lanes();
     w->predicted = w->defect = V(0.0);
     for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
-        const vd *x = w->x + k * NX, *u = w->u + k * NU;
-        gen_expand(x, u, w->p, out);
-        const vd *fx = out + NX, *fu = fx + NX * NX, *lx = fu + NX * NU, *lu = lx + NX, *lxx = lu + NU;
-        const vd *lux = lxx + NX * NX, *luu = lux + NU * NX;
-        vd gap[NX], vx[NX], Vfx[NX][NX], Vfu[NX][NU];
-        for (int i = 0; i < NX; ++i) {
-            gap[i] = out[i] - w->x[(k + 1) * NX + i];
-            w->defect = vd_max(w->defect, vd_abs(gap[i]));
-        }
-        for (int i = 0; i < NX; ++i) {
-            vx[i] = Vx[i];
-            for (int j = 0; j < NX; ++j) vx[i] += Vxx[i][j] * gap[j];
-            vx[i] *= g;
-            for (int j = 0; j < NX; ++j) {
-                vd v = V(0.0);
-                for (int l = 0; l < NX; ++l) v += Vxx[i][l] * fx[j * NX + l];
-                Vfx[i][j] = g * v;
-            }
-            for (int a = 0; a < NU; ++a) {
-                vd v = V(0.0);
-                for (int l = 0; l < NX; ++l) v += Vxx[i][l] * fu[a * NX + l];
-                Vfu[i][a] = g * v;
-            }
-        }
-        vd Qx[NX], Qu[NU], Qux[NU][NX], Quu[NU][NU], H[NU][NU], Hux[NU][NX];
-        for (int i = 0; i < NX; ++i) {
-            Qx[i] = lx[i];
-            for (int l = 0; l < NX; ++l) Qx[i] += fx[i * NX + l] * vx[l];
-        }
-        for (int a = 0; a < NU; ++a) {
-            Qu[a] = lu[a];
-            for (int l = 0; l < NX; ++l) Qu[a] += fu[a * NX + l] * vx[l];
-            for (int i = 0; i < NX; ++i) {
-                vd v = lux[i * NU + a], r = V(0.0);
-                for (int l = 0; l < NX; ++l) {
-                    v += fu[a * NX + l] * Vfx[l][i];
-                    r += fu[a * NX + l] * fx[i * NX + l];
-                }
-                Qux[a][i] = v;
-                Hux[a][i] = v + w->mu * r; /* as if Vxx were Vxx + mu/gamma I */
-            }
-            for (int b = 0; b < NU; ++b) {
-                vd v = luu[b * NU + a], r = V(0.0);
-                for (int l = 0; l < NX; ++l) {
-                    v += fu[a * NX + l] * Vfu[l][b];
-                    r += fu[a * NX + l] * fu[b * NX + l];
-                }
-                Quu[a][b] = v;
-                H[a][b] = v + w->mu * r + (a == b ? w->mu * 1e-3 + 1e-12 : V(0.0));
-            }
-        }
+        const vd *u = w->u + k * NU;
+        gen_q(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
+        const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NX * NX, *Quu = Qux + NU * NX;
+        const vd *Rux = Quu + NU * NU, *Ruu = Rux + NU * NX;
+        for (int i = 0; i < NX; ++i) w->defect = vd_max(w->defect, vd_abs(out[i]));
+        /* Regularised as if Vxx were Vxx + mu / gamma I. */
+        vd H[NU][NU];
+        for (int a = 0; a < NU; ++a)
+            for (int b = 0; b < NU; ++b)
+                H[a][b] = Quu[b * NU + a] + w->mu * Ruu[b * NU + a] + (a == b ? w->mu * 1e-3 + 1e-12 : V(0.0));
         vd low[NU], high[NU], d[NU], F[NU][NU];
         vl is_free[NU];
         for (int a = 0; a < NU; ++a) {
@@ -245,7 +204,7 @@ static void backward(const mpc_problem *m, lanes *w) {
         vd *K = w->K + k * NU * NX;
         for (int i = 0; i < NX; ++i) {
             vd b[NU];
-            for (int a = 0; a < NU; ++a) b[a] = vd_select(is_free[a], -Hux[a][i], V(0.0));
+            for (int a = 0; a < NU; ++a) b[a] = vd_select(is_free[a], -Qux[i * NU + a] - w->mu * Rux[i * NU + a], V(0.0));
             substitute(F, b);
             for (int a = 0; a < NU; ++a) K[i * NU + a] = b[a];
         }
@@ -254,26 +213,25 @@ static void backward(const mpc_problem *m, lanes *w) {
         for (int a = 0; a < NU; ++a) {
             w->k[k * NU + a] = d[a];
             Quud[a] = V(0.0);
-            for (int b = 0; b < NU; ++b) Quud[a] += Quu[a][b] * d[b];
+            for (int b = 0; b < NU; ++b) Quud[a] += Quu[b * NU + a] * d[b];
             slope += Qu[a] * d[a];
             half += 0.5 * d[a] * Quud[a];
             for (int i = 0; i < NX; ++i) {
                 QuuK[a][i] = V(0.0);
-                for (int b = 0; b < NU; ++b) QuuK[a][i] += Quu[a][b] * K[i * NU + b];
+                for (int b = 0; b < NU; ++b) QuuK[a][i] += Quu[b * NU + a] * K[i * NU + b];
             }
         }
         w->predicted -= weight * (slope + half);
         for (int i = 0; i < NX; ++i) {
             Vx[i] = Qx[i];
-            for (int a = 0; a < NU; ++a) Vx[i] += K[i * NU + a] * (Quud[a] + Qu[a]) + Qux[a][i] * d[a];
+            for (int a = 0; a < NU; ++a) Vx[i] += K[i * NU + a] * (Quud[a] + Qu[a]) + Qux[i * NU + a] * d[a];
         }
         for (int i = 0; i < NX; ++i)
             for (int j = i; j < NX; ++j) {
-                vd v = lxx[j * NX + i];
-                for (int l = 0; l < NX; ++l) v += fx[i * NX + l] * Vfx[l][j];
+                vd v = Qxx[j * NX + i];
                 for (int a = 0; a < NU; ++a)
-                    v += K[i * NU + a] * QuuK[a][j] + K[i * NU + a] * Qux[a][j] + Qux[a][i] * K[j * NU + a];
-                Vxx[i][j] = Vxx[j][i] = v;
+                    v += K[i * NU + a] * (QuuK[a][j] + Qux[j * NU + a]) + Qux[i * NU + a] * K[j * NU + a];
+                Vxx[j * NX + i] = Vxx[i * NX + j] = v;
             }
     }
 }
@@ -348,6 +306,7 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
         if (!busy) break;
         for (int l = 0; l < LANES; ++l)
             if (problem[l] < 0) load_lane(m, b, w, l, spare); /* idle lanes repeat a problem: finite numbers, ignored */
+        if (fresh_any) gen_prepare(w->p, w->p + NP);
         if (fresh_any && b->cold) {
             vd J = rollout_open(m, w, w->x_new, w->u);
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
@@ -357,6 +316,8 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
         /* A point is a solution when the model holds and the quadratic model promises no further decrease. */
         vd scale = V(1.0) + vd_abs(w->J);
         vl finite_J = vd_lt(vd_abs(w->J), V(INFINITY));
+        /* A warm start that obeys the model is as good as a rollout, only its cost is not known before the step. */
+        vl nearly = vd_lt(w->defect, V(1e-9));
         vl small = finite_J & w->pd & vd_lt(w->predicted, m->tolerance * scale);
         /* A step found with heavy regularisation promises little without being near a solution. */
         small &= vd_le(w->mu, V(1.0));
@@ -378,7 +339,9 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             if (problem[l] < 0) continue;
             int64_t status = RUNNING;
             ++count[l];
-            if (small[l]) status = CONVERGED;
+            if (small[l] || (nearly[l] && moved[l] && w->pd[l] && w->mu[l] <= 1.0 &&
+                             w->predicted[l] < m->tolerance * (1.0 + fabs(w->J[l]))))
+                status = CONVERGED;
             else if (moved[l]) w->mu[l] = w->mu[l] * 0.2 > MU_MIN ? w->mu[l] * 0.2 : 0.0;
             else {
                 w->mu[l] = w->mu[l] > 0.0 ? w->mu[l] * 8.0 : MU_FIRST;
@@ -401,6 +364,7 @@ static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, co
                             const double *candidates, int64_t n_candidates, double *J) {
     int64_t size = m->horizon * NU;
     for (int j = 0; j < NP; ++j) w->p[j] = V(theta[j]);
+    gen_prepare(w->p, w->p + NP);
     for (int j = 0; j < NX; ++j) w->s[j] = V(x0[j]);
     for (int64_t c = 0; c < n_candidates; c += LANES) {
         for (int l = 0; l < LANES; ++l)

@@ -59,7 +59,7 @@ class DDPSolver(Solver):
 
     Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
     and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. A cold
-        tolerance: Predicted decrease of the cost, relative to 1 + |V|, below which a problem counts as solved.
+    problem is solved from the eight cheapest of 64 fixed input sequences, and the best solution is kept; a warm one from
     its plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease.
 

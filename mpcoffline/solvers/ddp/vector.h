@@ -1,11 +1,18 @@
 /* LANES doubles that share an instruction: GCC and Clang vector extensions, in plain C. */
 #include <math.h>
 
+/* As many as the processor's registers hold: wider vectors spill, and GCC compares them one by one. */
+#if defined(__AVX512F__)
 #define LANES 8
+#elif defined(__AVX__)
+#define LANES 4
+#else
+#define LANES 2
+#endif
 typedef double vd __attribute__((vector_size(8 * LANES)));
 typedef long long vl __attribute__((vector_size(8 * LANES)));
 
-static inline vd V(double a) { return (vd){a, a, a, a, a, a, a, a}; }
+static inline vd V(double a) { return a - (vd){0}; }
 static inline vd vd_select(vl mask, vd a, vd b) { return (vd)((mask & (vl)a) | (~mask & (vl)b)); }
 static inline vl vd_lt(vd a, vd b) { return a < b; }
 static inline vl vd_le(vd a, vd b) { return a <= b; }
