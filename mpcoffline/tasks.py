@@ -48,7 +48,7 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
 
         |phid| up to            5        10        14  rad/s
         pendulum           0.0001     0.001     0.003
-        cart-pole          0.0005     0.005     0.03
+        cart-pole          0.0005     0.005     0.03   (cart speeds up to 5 m/s)
 
     The linear model of alpha = 0 is the plant's up to rounding.
 
