@@ -46,8 +46,8 @@ _FORMATS = {
 def source(mpc: MPC) -> str:
     """The complete C source for an MPC; horizon, discount, bounds and theta are arguments of the compiled functions.
 
-    What depends on theta alone is computed once a problem, in ``gen_prepare``; the products of the Riccati recursion are
-    generated too, so that zeros in the model's derivatives cost nothing.
+    What depends on theta alone is computed once a problem, in ``gen_prepare``; the products of the Riccati recursion
+    are generated too, so that zeros in the model's derivatives cost nothing.
 
     Raises:
         InvalidArgumentError: If a function of the MPC cannot be expanded to SX or has no counterpart in C.
