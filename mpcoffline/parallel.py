@@ -48,8 +48,9 @@ def map(
 ) -> list[Result]:
     """Applies a function to every job, several at a time, each in a process with one thread.
 
-    The processes are spawned, not forked: nothing of this process but ``fn`` and the job reaches them (both are pickled, so
-    ``fn`` must be a function of a module). The results do not depend on the number of workers. Ctrl-C ends all workers.
+    The processes are spawned, not forked: nothing of this process but ``fn`` and the job reaches them (both are
+    pickled, so ``fn`` must be a function of a module). The results do not depend on the number of workers. Ctrl-C
+    ends all workers.
 
     Args:
         fn: What to do with a job.

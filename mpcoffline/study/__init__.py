@@ -1,0 +1,8 @@
+"""The experiments of arXiv:2301.01667, each as data -> table -> figure."""
+
+from __future__ import annotations
+
+from .main_job import run_task
+from .results import ControllerResult, TaskResult
+
+__all__ = ["ControllerResult", "TaskResult", "run_task"]

@@ -1,0 +1,111 @@
+"""The figure of the main job: closed loops from one start, and the cost of each controller."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from mpcoffline.plotting import (
+    PAGE_WIDTH,
+    Array,
+    Signal,
+    draw_bars,
+    draw_signal,
+    legend_handles,
+    new_figure,
+    paper_style,
+)
+
+from .results import REFERENCE, TaskResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# (label, state coordinate, whether it is a wrapping angle, half-width of the success band) of the panels of a task.
+_STATES: dict[str, tuple[tuple[str, int, bool, float | None], ...]] = {
+    "linear": (("$x$ (m)", 0, False, 0.05), ("$y$ (m)", 1, False, 0.05)),
+    "pendulum": (("angle $\\varphi$ (rad)", 0, True, 0.3), ("speed $\\dot\\varphi$ (rad/s)", 1, False, None)),
+    "cartpole": (("angle $\\varphi$ (rad)", 2, True, 0.3), ("position $x$ (m)", 0, False, None)),
+}
+_ACTIONS: dict[str, tuple[str, ...]] = {
+    "linear": ("force $F_x$ (N)", "force $F_y$ (N)"),
+    "pendulum": ("torque $u$ (N m)",),
+    "cartpole": ("force $u$ (N)",),
+}
+# Seconds that are shown where a task has settled long before the end of the episode.
+_SECONDS = {"linear": 5.0}
+SHOWN = ("MPC_1", "MPC_2", "MPC_3")
+
+
+def main_job_figure(result: TaskResult) -> Figure:
+    """Closed loops of MPC_1, MPC_2, MPC_3 from one start with the input bounds, and their costs as bars.
+
+    Args:
+        result: What :func:`run_task` found.
+
+    Returns:
+        The figure; :func:`mpcoffline.plotting.save_figure` writes it.
+    """
+    signals = _signals(result)
+    with paper_style():
+        figure = new_figure(PAGE_WIDTH, 0.6 + 2.85 * max(1.0, 0.3 * len(signals)))
+        left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(2.1, 1.0)))
+        panels = np.atleast_1d(left.subplots(len(signals), 1, sharex=True))
+        for axes, signal in zip(panels, signals, strict=True):
+            draw_signal(axes, signal, result.dt)
+        left.align_ylabels()
+        panels[-1].set_xlabel("time (s)")
+        length = result.dt * (len(signals[0].values[SHOWN[0]]) - 1)
+        panels[-1].set_xlim(0.0, min(length, _SECONDS.get(result.task, length)))
+        handles, labels = legend_handles(SHOWN)
+        left.legend(handles, labels, loc="outside upper center", ncols=3, handlelength=3.2)
+        bars = right.subplots()
+        draw_bars(bars, _relative_costs(result))
+        bars.set_ylabel("cost relative to the reference")
+        _explain_bars(right)
+    return figure
+
+
+def _signals(result: TaskResult) -> list[Signal]:
+    states, actions = ({name: _example(result, name)[i] for name in SHOWN} for i in (0, 1))
+    space = gym.make(result.env_id).action_space
+    signals = [
+        Signal(label, {name: s[:, i] for name, s in states.items()}, target=0.0, angle=angle, band=band)
+        for label, i, angle, band in _STATES[result.task]
+    ]
+    for i, label in enumerate(_ACTIONS[result.task]):
+        bounds = (float(space.low[i]), float(space.high[i])) if isinstance(space, spaces.Box) else None
+        signals.append(Signal(label, {name: a[:, i] for name, a in actions.items()}, bounds=bounds, held=True))
+    return signals
+
+
+def _example(result: TaskResult, name: str) -> tuple[Array, Array]:
+    controller = result.controller(name)
+    return np.array(controller.states, dtype=np.float64), np.array(controller.actions, dtype=np.float64)
+
+
+def _relative_costs(result: TaskResult) -> dict[str, dict[str, float]]:
+    reference = result.controller(REFERENCE)
+    return {
+        name: {
+            "J": result.controller(name).cost / reference.cost,
+            "Jd": result.controller(name).discounted_cost / reference.discounted_cost,
+        }
+        for name in SHOWN
+    }
+
+
+def _explain_bars(figure: Figure) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles = [
+        Patch(facecolor="#606060", edgecolor="#606060"),
+        Patch(facecolor="white", edgecolor="#606060", hatch="////"),
+        Line2D([], [], color="black", linewidth=0.8, linestyle=(0, (1, 1.2))),
+    ]
+    labels = ["$J$", "$J_d$", "reference"]
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, handlelength=1.6, columnspacing=1.0)

@@ -1,0 +1,211 @@
+"""What the main job found: numbers, and the table in the forms in which people want it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mpcoffline.archive import file_errors
+from mpcoffline.errors import FileFormatError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_FORMAT = "mpcoffline main job"
+_VERSION = 1
+REFERENCE = "reference"
+
+
+@dataclass(frozen=True)
+class ControllerResult:
+    """The closed-loop figures of one controller.
+
+    Attributes:
+        name: ``"MPC_1"``, ``"MPC_2"``, ``"MPC_3"``, ``"reference"`` or ``"behaviour"``.
+        description: What it is.
+        costs: Undiscounted cost J of each episode.
+        discounted_costs: Discounted cost Jd of each episode.
+        successes: Whether each episode ended in success; None where the data do not tell.
+        fit_time: Time of the regressions in s; None where nothing was learned.
+        solve_time: Mean time of one MPC in s; None for what is no MPC.
+        n_solves: MPCs solved.
+        n_failures: MPCs whose solution was not accepted.
+        states: The state s along the example episode, ``(T + 1, nx)``.
+        actions: The actions along it, ``(T, nu)``.
+    """
+
+    name: str
+    description: str
+    costs: list[float]
+    discounted_costs: list[float]
+    successes: list[bool] | None
+    fit_time: float | None = None
+    solve_time: float | None = None
+    n_solves: int = 0
+    n_failures: int = 0
+    states: list[list[float]] | None = None
+    actions: list[list[float]] | None = None
+
+    @property
+    def cost(self) -> float:
+        """Mean J."""
+        return sum(self.costs) / len(self.costs)
+
+    @property
+    def discounted_cost(self) -> float:
+        """Mean Jd."""
+        return sum(self.discounted_costs) / len(self.discounted_costs)
+
+    @property
+    def success(self) -> float | None:
+        """Share of episodes that ended in success."""
+        return None if self.successes is None else sum(self.successes) / len(self.successes)
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """The outcome of the main job for one task.
+
+    Attributes:
+        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        alpha: Size of the model error.
+        seed: Seed of model error, learning and starts.
+        env_id: Gymnasium id.
+        dataset_id: What was learned from.
+        value: The form of (VALUE).
+        discount: gamma of Jd, of the MPCs and of the learning.
+        dt: Sampling time in s.
+        starts: Kind of start of each episode.
+        example: Number of the episode whose trajectories are kept: the one that costs the reference most.
+        theta: Parameters of each MPC by name.
+        controllers: MPC_1, MPC_2, MPC_3 and the reference, from the same starts.
+        behaviour: The agent that made the data, in its last episodes there: exploration included, other starts.
+    """
+
+    task: str
+    alpha: float
+    seed: int
+    env_id: str
+    dataset_id: str
+    value: str
+    discount: float
+    dt: float
+    starts: list[str]
+    example: int
+    theta: dict[str, dict[str, Any]]
+    controllers: list[ControllerResult]
+    behaviour: ControllerResult
+
+    def controller(self, name: str) -> ControllerResult:
+        """The controller of this name."""
+        return next(c for c in self.controllers if c.name == name)
+
+    def relative_performance(self, name: str) -> tuple[float, float]:
+        """J of the reference over that of the controller, and the same for Jd: 1 is as good, more is better."""
+        reference, controller = self.controller(REFERENCE), self.controller(name)
+        return reference.cost / controller.cost, reference.discounted_cost / controller.discounted_cost
+
+    @property
+    def title(self) -> str:
+        """One line that says what the table is about."""
+        kinds = [f"{self.starts.count(kind)} {kind}" for kind in dict.fromkeys(self.starts)]
+        return f"{self.task}, alpha = {self.alpha:g}, seed {self.seed}: {len(self.starts)} starts ({', '.join(kinds)})"
+
+    def rows(self) -> list[dict[str, str]]:
+        """The table: one row a controller, cells as text."""
+        shown = []
+        for result in [*self.controllers, self.behaviour]:
+            compared = result is not self.behaviour
+            ratios = [f"{r:.3f}" for r in self.relative_performance(result.name)] if compared else ["", ""]
+            shown.append(
+                {
+                    "controller": result.name,
+                    "J": f"{result.cost:.1f}",
+                    "Jd": f"{result.discounted_cost:.2f}",
+                    "success": "" if result.success is None else f"{result.success:.0%}",
+                    "rel. J": ratios[0],
+                    "rel. Jd": ratios[1],
+                    "fit (s)": "" if result.fit_time is None else f"{result.fit_time:.1f}",
+                    "solve (ms)": "" if result.solve_time is None else f"{1e3 * result.solve_time:.2f}",
+                }
+            )
+        return shown
+
+    def notes(self) -> list[str]:
+        """What one must know to read the table."""
+        failed = {c.name: c.n_failures for c in self.controllers if c.n_failures}
+        return [
+            *(f"{c.name}: {c.description}." for c in [*self.controllers, self.behaviour]),
+            f"J: cost of an episode, mean; Jd: discounted with {self.discount:g}. rel.: the reference's cost over the"
+            " controller's; more is better.",
+            f"fit: time of the regressions; that of MPC_2 includes (VALUE, {self.value}), which MPC_3 shares.",
+            "solve: mean time of one MPC in closed loop.",
+            *(f"{name}: {n} solves failed and fell back to the previous plan." for name, n in failed.items()),
+        ]
+
+    def table(self) -> Table:
+        """The table for the terminal."""
+        from rich import box
+        from rich.table import Table
+
+        rows = self.rows()
+        table = Table(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+        for name in rows[0]:
+            table.add_column(name, justify="left" if name == "controller" else "right", no_wrap=True)
+        for row in rows:
+            table.add_row(*row.values(), style="bold" if row["controller"] == "MPC_3" else None)
+        return table
+
+    def markdown(self) -> str:
+        """The table and its notes in Markdown."""
+        rows = self.rows()
+        lines = [list(rows[0]), ["---"] + ["--:"] * (len(rows[0]) - 1), *(list(row.values()) for row in rows)]
+        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        notes = "\n".join(f"* {note}" for note in self.notes())
+        return f"# {self.title}\n\n{table}\n\n{notes}\n\nData: `{self.dataset_id}`, environment `{self.env_id}`.\n"
+
+    def save(self, folder: Path) -> list[Path]:
+        """Writes results.json (everything), results.md (table and notes) and results.csv (table).
+
+        Args:
+            folder: An existing folder.
+
+        Returns:
+            The files.
+        """
+        sheet = io.StringIO()
+        writer = csv.DictWriter(sheet, list(self.rows()[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows())
+        document = {"format": _FORMAT, "version": _VERSION} | asdict(self)
+        contents = {
+            "results.json": json.dumps(document, indent=1) + "\n",
+            "results.md": self.markdown(),
+            "results.csv": sheet.getvalue(),
+        }
+        for name, text in contents.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        return [folder / name for name in contents]
+
+    @classmethod
+    def load(cls, path: Path) -> TaskResult:
+        """Reads a results.json.
+
+        Args:
+            path: The file.
+
+        Raises:
+            FileFormatError: If it is damaged or another file.
+        """
+        with file_errors(path):
+            document = json.loads(path.read_text(encoding="utf-8"))
+            found = document.pop("format"), document.pop("version")
+            if found != (_FORMAT, _VERSION):
+                raise FileFormatError(str(path), expected=f"{_FORMAT}, version {_VERSION}", actual=str(found))
+            controllers = [ControllerResult(**c) for c in document.pop("controllers")]
+            behaviour = ControllerResult(**document.pop("behaviour"))
+            return cls(controllers=controllers, behaviour=behaviour, **document)
