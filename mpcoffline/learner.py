@@ -235,7 +235,8 @@ class OfflineMPCLearner:
             learner.history = [(int(epoch), dict(metrics)) for epoch, metrics in document["history"]]
             if document["result"] is not None:
                 theta = learner.nominal_mpc.space.checked(document["result"].pop("theta"))
-                learner.result = FitResult(theta, **document["result"])
+                losses = {name: float(loss) for name, loss in document["result"].items()}
+                learner.result = FitResult(theta, **losses)
             if document["observation_space"] is not None:
                 learner._observation_space = box_from_json(document["observation_space"])
             if arrays:

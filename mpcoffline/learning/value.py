@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from mpcoffline.datasets.transitions import Columns, TransitionTable
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
 
 from .checks import check_integers, check_number
 from .progress import Report, silent
@@ -91,15 +91,17 @@ class ValueFunction(nn.Module):
         """The inverse of :meth:`to_arrays`.
 
         Raises:
-            FileFormatError: If arrays are missing or of the wrong shape.
+            FileFormatError: If arrays are missing, of the wrong shape, or not finite.
         """
         try:
             n_linear = sum(name.startswith("net.") and name.endswith(".weight") for name in arrays)
             hidden = [len(arrays[f"net.{2 * i}.weight"]) for i in range(n_linear - 1)]
             value = cls(len(arrays["mean"]), hidden)
             value.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in arrays.items()})
-        except (KeyError, RuntimeError, TypeError) as error:
+        except (KeyError, RuntimeError, TypeError, MPCOfflineError) as error:
             raise FileFormatError("value function", expected="weights of a network", actual=str(error)) from error
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            raise FileFormatError("value function", expected="finite weights", actual="NaN or inf")
         return value
 
 

@@ -188,7 +188,7 @@ def test_arrays_hold_the_whole_function() -> None:
         np.testing.assert_array_equal(array, arrays[name])
 
 
-@pytest.mark.parametrize("damage", ["missing", "shape", "foreign", "empty", "kind", "scalar"])
+@pytest.mark.parametrize("damage", ["missing", "shape", "foreign", "empty", "kind", "scalar", "nan"])
 def test_damaged_arrays_are_refused(damage: str) -> None:
     arrays: dict[str, NDArray[Any]] = ValueFunction(2, (4, 4)).to_arrays()
     if damage == "missing":
@@ -201,6 +201,8 @@ def test_damaged_arrays_are_refused(damage: str) -> None:
         arrays = {}
     elif damage == "kind":
         arrays["net.0.bias"] = np.array(["a", "b", "c", "d"])
+    elif damage == "nan":
+        arrays["net.0.bias"] = np.full(4, np.nan, dtype=np.float32)
     else:
         arrays["mean"] = np.array(1.0)
     with pytest.raises(FileFormatError, match="value function"):
