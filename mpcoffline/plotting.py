@@ -179,6 +179,8 @@ def draw_bars(axes: Axes, groups: Mapping[str, Mapping[str, float]], unit: float
                 ha="center",
                 va="bottom",
                 fontsize=6.5,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4},
+                zorder=5,
             )
     if unit is not None:
         axes.axhline(unit, color="black", linewidth=0.8, linestyle=(0, (1, 1.2)), zorder=4)
@@ -242,7 +244,7 @@ def _draw_target(axes: Axes, target: float, band: float | None) -> None:
 def _draw_bounds(axes: Axes, low: float, high: float) -> None:
     values = np.array(axes.dataLim.intervaly)
     if (values > 0.5 * low).all() and (values < 0.5 * high).all():  # far from both: they would flatten the curves
-        text = f"bounds {low:g}, {high:g}"
+        text = f"bounds $\\pm${high:g}" if low == -high else f"bounds {low:g}, {high:g}"
         axes.annotate(text, (1.0, 0.96), xycoords="axes fraction", ha="right", va="top", fontsize=7, color="#595959")
         return
     margin = 0.12 * (high - low)

@@ -1,0 +1,55 @@
+# Shared by the scripts here: makes .venv and installs the project into it. Sourced, not run.
+# Needs bash, Python >= 3.11 and a C compiler.
+
+say() { printf '\n==> %s\n' "$*"; }
+refuse() { printf '%s: %s\n' "$(basename "$0")" "$*" >&2; exit 2; }
+
+# A command that runs a Python of at least 3.11; $PYTHON is asked first.
+find_python() {
+    local candidate
+    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11 python; do
+        if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then
+            printf '%s\n' "$candidate"
+            return
+        fi
+    done
+    return 1
+}
+
+# prepare_venv [dev]: .venv with the project, and with what its tests need.
+prepare_venv() {
+    local extra="${1:-}" target='.' stamp python fingerprint pin
+    [ -n "$extra" ] && target=".[$extra]"
+
+    command -v "${CC:-cc}" >/dev/null 2>&1 || command -v gcc >/dev/null 2>&1 || command -v clang >/dev/null 2>&1 ||
+        refuse 'expected a C compiler (cc, gcc or clang) on the PATH, found none.' \
+            'On Debian or Ubuntu: apt-get install gcc. On macOS: xcode-select --install.'
+
+    if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then
+        python="$(find_python)" ||
+            refuse "expected Python 3.11 or later, found $(python3 --version 2>&1 || echo none)." \
+                'Install one, or name it: PYTHON=/path/to/python3.12' "$0"
+        "$python" -c 'import ensurepip, venv' >/dev/null 2>&1 ||
+            refuse "expected $python to have the modules venv and ensurepip." \
+                'On Debian or Ubuntu: apt-get install python3-venv.'
+        say "Making .venv with $("$python" --version)"
+        rm -rf .venv
+        "$python" -m venv .venv
+    fi
+
+    # What the installation depends on; unchanged means nothing to install.
+    fingerprint="$(cat pyproject.toml constraints.txt | cksum) $(pwd)"
+    for stamp in .venv/.installed-dev ".venv/.installed-$extra"; do
+        if [ "$(cat "$stamp" 2>/dev/null)" = "$fingerprint" ]; then
+            say 'The project is installed in .venv already'
+            return
+        fi
+    done
+    # torch first and pinned: left to itself, pip may choose a build with gigabytes of GPU libraries.
+    pin="$(grep '^torch==' constraints.txt)"
+    say "Installing $pin into .venv"
+    .venv/bin/python -m pip install --disable-pip-version-check -q "$pin" -c constraints.txt
+    say "Installing the project (editable) and what it needs into .venv"
+    .venv/bin/python -m pip install --disable-pip-version-check -q -c constraints.txt -e "$target"
+    printf '%s\n' "$fingerprint" >".venv/.installed-$extra"
+}
