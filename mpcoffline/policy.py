@@ -80,7 +80,7 @@ class MPCPolicy(BasePolicy):
             ("observation_space", observation_space, mpc.nx),
             ("action_space", action_space, mpc.nu),
         ):
-            if space.shape != (size,):
+            if not isinstance(space, spaces.Box) or space.shape != (size,):
                 raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
         if solver != "auto" and solver not in SOLVERS:
             raise UnknownIdError.of("solver", solver, ["auto", *SOLVERS])
@@ -143,7 +143,7 @@ class MPCPolicy(BasePolicy):
 
     def _checked_observations(self, observation: ArrayLike) -> NDArray[np.float64]:
         array = np.asarray(observation, dtype=np.float64)
-        if array.ndim not in (1, 2) or array.shape[-1] != self.mpc.nx:
+        if array.ndim not in (1, 2) or array.shape[-1] != self.mpc.nx or not array.size:
             raise InvalidArgumentError(
                 "observation",
                 expected=f"shape ({self.mpc.nx},) or (B, {self.mpc.nx})",
@@ -160,6 +160,10 @@ class MPCPolicy(BasePolicy):
         """The plan to start from, without the rows whose episode has just begun."""
         if state is None:
             return Plan.none(n_problems, self.mpc)
+        if len(state) != 2:
+            raise InvalidArgumentError(
+                "state", expected="what predict returned: states and inputs", actual=f"{len(state)} arrays"
+            )
         plan = Plan(*state)
         if len(plan.u) != n_problems:
             raise InvalidArgumentError(
@@ -167,7 +171,12 @@ class MPCPolicy(BasePolicy):
             )
         if episode_start is None:
             return plan
-        return plan.select(~np.broadcast_to(np.asarray(episode_start, dtype=bool), (n_problems,)))
+        started = np.asarray(episode_start, dtype=bool)
+        if started.shape not in ((), (n_problems,)):
+            raise InvalidArgumentError(
+                "episode_start", expected=f"shape ({n_problems},)", actual=f"shape {started.shape}"
+            )
+        return plan.select(~np.broadcast_to(started, (n_problems,)))
 
     def _with_fallback(self, solution: Solution, warm_start: Plan) -> tuple[NDArray[np.float64], Plan]:
         """First inputs and the plan for the next step; where the solve failed, those of the plan before."""
