@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 
 if TYPE_CHECKING:
+    from gymnasium import Env
     from minari import MinariDataset
 
     from mpcoffline.learner import OfflineMPCLearner
@@ -252,14 +253,11 @@ def evaluate(
     ] = None,
 ) -> None:
     """Run a policy in closed loop and report its cost."""
-    import gymnasium as gym
-
     import mpcoffline
 
     controller = _loaded_policy(policy)
-    target = env if alpha is None else gym.make(env, alpha=alpha)
+    target = _environment(env, alpha, start)
     options = None if start is None else {"start": start.value}
-    _check_start(env, start)
     with console.status("Closed loops"):
         result = mpcoffline.evaluate(
             controller, target, episodes, seed, discount=controller.mpc.discount, options=options
@@ -328,18 +326,21 @@ def _loaded_policy(path: Path) -> MPCPolicy:
             raise not_a_policy from None
 
 
-def _check_start(env: str, start: Start | None) -> None:
-    """Refuses a kind of start that the environment does not know, before anything is solved."""
+def _environment(env_id: str, alpha: float | None, start: Start | None) -> Env[Any, Any]:
+    """The environment; options that it does not know are refused before anything is solved."""
     import gymnasium as gym
 
     from mpcoffline.envs import ControlTask
 
-    if start is None:
-        return
-    task = gym.make(env).unwrapped
+    try:
+        env: Env[Any, Any] = gym.make(env_id) if alpha is None else gym.make(env_id, alpha=alpha)
+    except TypeError as error:
+        raise InvalidArgumentError("--alpha", expected=f"none for {env_id}", actual=str(alpha)) from error
+    task = env.unwrapped
     known = task.starts if isinstance(task, ControlTask) else ()
-    if start.value not in known:
-        raise InvalidArgumentError("--start", expected=f"one of {known} for {env}", actual=repr(start.value))
+    if start is not None and start.value not in known:
+        raise InvalidArgumentError("--start", expected=f"one of {known} for {env_id}", actual=repr(start.value))
+    return env
 
 
 def _parameter_table(learner: OfflineMPCLearner) -> Table:

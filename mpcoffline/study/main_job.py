@@ -43,6 +43,7 @@ def run_task(
     value: str | None = None,
     workers: int | None = None,
     progress: bool = True,
+    **learner_options: Any,
 ) -> TaskResult:
     """Learns MPC_2 and MPC_3 of a task from a data set and compares them with MPC_1 in closed loop.
 
@@ -64,6 +65,7 @@ def run_task(
         value: ``"residual"`` (the published one, default), ``"td"`` or ``"expectile"``.
         workers: Processes for the closed loops; one a CPU core by default.
         progress: Whether to draw progress bars.
+        **learner_options: Further arguments of :class:`~mpcoffline.OfflineMPCLearner`, e.g. ``prior=1e-2``.
 
     Returns:
         The figures; ``result.table()`` is the table for a terminal.
@@ -77,11 +79,13 @@ def run_task(
         raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
     setup = setup_of(task, alpha, seed)
     data = load_dataset(dataset or setup.dataset_id)
-    # Made before the work, so that nothing is computed in vain for a folder that cannot be written.
+    options = {"seed": seed, "value": value} | learner_options
+    OfflineMPCLearner(setup.nominal, **options)  # refuses wrong options before a folder is made
+    # The folder is made before the work, so that nothing is computed in vain where it cannot be written.
     folder = Path(output) / "controllers"
     folder.mkdir(parents=True, exist_ok=True)
 
-    learners = _learn(setup.nominal, data, seed, value, progress)
+    learners = _learn(setup.nominal, data, progress, **options)
     mpcs = {"MPC_1": setup.nominal} | {name: learner.mpc for name, (learner, _) in learners.items()}
     mpcs[REFERENCE] = setup.reference
     for name, (learner, _) in learners.items():
@@ -131,13 +135,13 @@ def run_task(
 
 
 def _learn(
-    nominal: MPC, data: MinariDataset, seed: int, value: str | None, progress: bool
+    nominal: MPC, data: MinariDataset, progress: bool, **options: Any
 ) -> dict[str, tuple[OfflineMPCLearner, float]]:
     """MPC_2 and MPC_3 from one value function, with the seconds that each took."""
     learners: dict[str, tuple[OfflineMPCLearner, float]] = {}
     value_function = None
     for name, learn in _LEARNED.items():
-        learner = OfflineMPCLearner(nominal, learn, seed=seed, value=value, value_function=value_function)
+        learner = OfflineMPCLearner(nominal, learn, value_function=value_function, **options)
         start = time.perf_counter()
         learner.fit(data, show_progress=progress)
         learners[name] = learner, time.perf_counter() - start

@@ -153,7 +153,7 @@ class TaskResult:
         from rich.table import Table
 
         rows = self.rows()
-        table = Table(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+        table = Table(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for name in rows[0]:
             table.add_column(name, justify="left" if name == "controller" else "right", no_wrap=True)
         for row in rows:

@@ -11,7 +11,8 @@ from scipy.linalg import solve_discrete_are
 
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.envs import ControlTask
-from mpcoffline.envs.linear_tracking import ACTION_WEIGHT, STATE_WEIGHT, plant_matrices
+from mpcoffline.envs.linear_tracking import ACTION_WEIGHT, MAX_ALPHA, STATE_WEIGHT, plant_matrices
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, QuadraticCost
 from mpcoffline.tasks import nominal_mpc
 
@@ -81,6 +82,8 @@ def setup_of(task: str, alpha: float, seed: int) -> Setup:
             reference=nominal_mpc(recipe.env_id),
             reference_description="MPC_1 with the true model (alpha = 0)",
         )
+    if not 0.0 <= alpha <= MAX_ALPHA:
+        raise InvalidArgumentError("alpha", expected=f"a number from 0 to {MAX_ALPHA:g}", actual=str(alpha))
     recipe = recipe.vary(alpha=alpha)
     nominal = nominal_mpc(recipe.env_id)
     return Setup(
