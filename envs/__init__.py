@@ -28,5 +28,6 @@ for _id, _module, _class in zip(
         gym.register(
             _id,
             entry_point=f"mpcoffline.envs.{_module}:{_class.__name__}",
+            vector_entry_point=f"mpcoffline.envs.{_module}:{_class.__name__.removesuffix('Env')}VectorEnv",
             max_episode_steps=_MAX_EPISODE_STEPS,
         )

@@ -106,7 +106,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
             ValueError: For an unknown option, or a state of the wrong shape, not finite or out of range.
         """
         super().reset(seed=seed)
-        self._state = self._initial_state(options or {})
+        self._state = self.initial_state(options or {})
         return self.observe(self._state), self._info(self._state, 0.0)
 
     def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -118,7 +118,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         """
         if self._state is None:
             raise gym.error.ResetNeeded("step: expected a reset environment, call reset() first.")
-        applied = self._checked_action(action)
+        applied = self.checked_action(action, self.action_space.shape)
         cost = float(self.cost(self._state, applied))
         self._state = self.next_state(self._state, applied)
         return self.observe(self._state), -cost, False, False, self._info(self._state, cost)
@@ -126,16 +126,18 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     def _info(self, state: Array, cost: float) -> dict[str, Any]:
         return {"cost": cost, "state": state.copy(), "is_success": bool(self.is_success(state))}
 
-    def _checked_action(self, action: NDArray[Any]) -> Array:
-        space = self.action_space
+    def checked_action(self, action: NDArray[Any], shape: tuple[int, ...]) -> Array:
+        """The action in float64, clipped to the bounds; refused when of another shape or not finite."""
         array = np.asarray(action, dtype=np.float64)
-        if array.shape != space.shape:
-            raise ValueError(f"action: expected shape {space.shape}, got {array.shape}.")
+        if array.shape != shape:
+            raise ValueError(f"action: expected shape {shape}, got {array.shape}.")
         if not np.isfinite(array).all():
             raise ValueError(f"action: expected finite numbers, got {array}.")
+        space = self.action_space
         return np.clip(array, space.low.astype(np.float64), space.high.astype(np.float64))
 
-    def _initial_state(self, options: dict[str, Any]) -> Array:
+    def initial_state(self, options: dict[str, Any]) -> Array:
+        """The state ``(nx,)`` that ``reset(options=...)`` starts from."""
         unknown = set(options) - {"state", "start"}
         if unknown or len(options) > 1:
             raise ValueError(

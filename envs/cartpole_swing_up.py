@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Array, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from .vector import ControlTaskVectorEnv
 
 GRAVITY = 9.8
 CART_MASS = 0.2
@@ -83,10 +84,10 @@ class CartPoleSwingUpEnv(ControlTask):
         xd, phi, phid = state[..., 1], state[..., 2], state[..., 3]
         u, sin, cos = action[..., 0], np.sin(phi), np.cos(phi)
         mass, moment = CART_MASS + POLE_MASS, POLE_MASS * HALF_LENGTH
-        drive = FRICTION * xd - u - moment * phid**2 * sin
-        inertia = HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * cos**2 / mass)
+        drive = FRICTION * xd - u - moment * np.square(phid) * sin
+        inertia = HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * np.square(cos) / mass)
         phidd = (GRAVITY * sin + cos * drive / mass) / inertia
-        xdd = (u - FRICTION * xd + moment * (phid**2 * sin - phidd * cos)) / mass
+        xdd = (u - FRICTION * xd + moment * (np.square(phid) * sin - phidd * cos)) / mass
         return np.stack([xd, xdd, phid, phidd], axis=-1)
 
     def next_state(self, state: Array, action: Array) -> Array:
@@ -98,7 +99,13 @@ class CartPoleSwingUpEnv(ControlTask):
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost 2 x^2 + phi^2 + 0.1 xd^2 + 0.1 phid^2 + 0.1 u^2."""
         x, xd, phi, phid = (state[..., i] for i in range(4))
-        return np.asarray(2.0 * x**2 + phi**2 + 0.1 * xd**2 + 0.1 * phid**2 + 0.1 * action[..., 0] ** 2)
+        return np.asarray(
+            2.0 * np.square(x)
+            + np.square(phi)
+            + 0.1 * np.square(xd)
+            + 0.1 * np.square(phid)
+            + 0.1 * np.square(action[..., 0])
+        )
 
     def observe(self, state: Array) -> Observation:
         """The observation [x, xd, cos phi, sin phi, phid]."""
@@ -117,3 +124,9 @@ class CartPoleSwingUpEnv(ControlTask):
             state[2] = wrap_angle(state[2])
             return state
         return rng.uniform([-1.0, -0.5, -np.pi, -1.0], [1.0, 0.5, np.pi, 1.0])
+
+
+class CartPoleSwingUpVectorEnv(ControlTaskVectorEnv):
+    """Many copies of :class:`CartPoleSwingUpEnv` stepped as arrays; see :class:`ControlTaskVectorEnv`."""
+
+    task_class = CartPoleSwingUpEnv

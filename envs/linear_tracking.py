@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
 from .base import Array, ControlTask, Observation, float32_box, float64_box
+from .vector import ControlTaskVectorEnv
 
 A0 = np.array([[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.9, 0.0], [0.0, 0.0, 0.0, 0.9]])
 B0 = np.array([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
@@ -82,12 +85,14 @@ class LinearTrackingEnv(ControlTask):
 
     def next_state(self, state: Array, action: Array) -> Array:
         """The plant: A s + B a."""
-        return state @ self.A.T + action @ self.B.T
+        return _product(self.A, state) + _product(self.B, action)
 
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost s'Ws + a'Ra."""
-        weighted = state**2 @ np.diag(STATE_WEIGHT) + action**2 @ np.diag(ACTION_WEIGHT)
-        return np.asarray(weighted, dtype=np.float64)
+        squares = np.concatenate(
+            [np.square(state) * np.diag(STATE_WEIGHT), np.square(action) * np.diag(ACTION_WEIGHT)], axis=-1
+        )
+        return np.asarray(sum(squares[..., i] for i in range(squares.shape[-1])))
 
     def observe(self, state: Array) -> Observation:
         """The state itself."""
@@ -112,6 +117,22 @@ def start_bound(A: Array, B: Array, n_steps: int = 100) -> float:
     return bound
 
 
+class LinearTrackingVectorEnv(ControlTaskVectorEnv):
+    """Many copies of :class:`LinearTrackingEnv` stepped as arrays; see :class:`ControlTaskVectorEnv`."""
+
+    task_class = LinearTrackingEnv
+
+
 def plant_matrices(alpha: float) -> tuple[Array, Array]:
     """The matrices A ``(4, 4)`` and B ``(4, 2)`` of the plant; ``alpha = 0`` is the nominal model."""
     return A0 + alpha * DELTA_A, B0 + alpha * DELTA_B
+
+
+def _product(matrix: Array, vectors: Array) -> Array:
+    """``matrix`` times each of ``vectors (..., n)``, summed column by column.
+
+    BLAS sums in an order that depends on the machine and on the number of vectors; this does not, so that a recorded
+    episode replays bit for bit, alone or among others.
+    """
+    columns = (vectors[..., j, None] * matrix[:, j] for j in range(matrix.shape[1]))
+    return functools.reduce(np.add, columns)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Array, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from .vector import ControlTaskVectorEnv
 
 GRAVITY = 9.8
 MASS = 1.0
@@ -76,7 +77,7 @@ class PendulumSwingUpEnv(ControlTask):
 
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost phi^2 + 0.1 phid^2 + 0.1 u^2."""
-        return np.asarray(state[..., 0] ** 2 + 0.1 * state[..., 1] ** 2 + 0.1 * action[..., 0] ** 2)
+        return np.asarray(np.square(state[..., 0]) + 0.1 * np.square(state[..., 1]) + 0.1 * np.square(action[..., 0]))
 
     def observe(self, state: Array) -> Observation:
         """The observation [cos phi, sin phi, phid]."""
@@ -93,3 +94,9 @@ class PendulumSwingUpEnv(ControlTask):
             angle = wrap_angle(np.pi + self.np_random.uniform(-0.2, 0.2, size=1))[0]
             return np.array([angle, self.np_random.uniform(-0.1, 0.1)])
         return self.np_random.uniform([-np.pi, -1.0], [np.pi, 1.0])
+
+
+class PendulumSwingUpVectorEnv(ControlTaskVectorEnv):
+    """Many copies of :class:`PendulumSwingUpEnv` stepped as arrays; see :class:`ControlTaskVectorEnv`."""
+
+    task_class = PendulumSwingUpEnv
