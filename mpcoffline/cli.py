@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 from enum import StrEnum
 from pathlib import Path
@@ -13,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperGroup
 
-from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
+from mpcoffline.errors import InvalidArgumentError, MPCOfflineError, UnknownIdError
 
 if TYPE_CHECKING:
     from gymnasium import Env
@@ -330,10 +331,14 @@ def _environment(env_id: str, alpha: float | None, start: Start | None) -> Env[A
     """The environment; options that it does not know are refused before anything is solved."""
     import gymnasium as gym
 
-    from mpcoffline.envs import ControlTask
+    from mpcoffline.envs import ENV_IDS, ControlTask
 
     try:
         env: Env[Any, Any] = gym.make(env_id) if alpha is None else gym.make(env_id, alpha=alpha)
+    except gym.error.UnregisteredEnv as error:
+        nearest = difflib.get_close_matches(env_id, ENV_IDS, n=1, cutoff=0.3)
+        hint = f"Did you mean {nearest[0]!r}?" if nearest else ""
+        raise UnknownIdError("--env", expected="a registered environment", actual=repr(env_id), hint=hint) from error
     except TypeError as error:
         raise InvalidArgumentError("--alpha", expected=f"none for {env_id}", actual=str(alpha)) from error
     task = env.unwrapped

@@ -27,7 +27,7 @@ prepare_venv() {
 
     if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then
         python="$(find_python)" ||
-            refuse "expected Python 3.11 or later, found $(python3 --version 2>&1 || echo none)." \
+            refuse "expected Python 3.11 or later, found $(python3 --version 2>/dev/null || echo none)." \
                 'Install one, or name it: PYTHON=/path/to/python3.12' "$0"
         "$python" -c 'import ensurepip, venv' >/dev/null 2>&1 ||
             refuse "expected $python to have the modules venv and ensurepip." \

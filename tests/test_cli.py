@@ -144,7 +144,7 @@ def test_evaluate_reports_costs(policy_file: Path) -> None:
 def test_evaluate_refuses_what_does_not_belong_together(policy_file: Path) -> None:
     assert "observation" in refused("evaluate", policy_file, "--env", "mpcoffline/CartPoleSwingUp-v0")
     assert "--start" in refused("evaluate", policy_file, "--env", "mpcoffline/LinearTracking-v0", "--start", "hanging")
-    assert "Nowhere-v0" in refused("evaluate", policy_file, "--env", "Nowhere-v0")
+    assert f"Did you mean '{PENDULUM}'?" in refused("evaluate", policy_file, "--env", "mpcoffline/Pendulum-v0")
     assert "--alpha" in refused("evaluate", policy_file, "--env", PENDULUM, "--alpha", "0.5")
 
 
