@@ -27,6 +27,7 @@ _FORMATS = {
     ca.OP_ATAN2: "vd_atan2({0}, {1})",
     ca.OP_HYPOT: "vd_hypot({0}, {1})",
     ca.OP_FMOD: "vd_fmod({0}, {1})",
+    ca.OP_REMAINDER: "vd_remainder({0}, {1})",
     ca.OP_COPYSIGN: "vd_copysign({0}, {1})",
     ca.OP_LT: "vd_bool({0} < {1})",
     ca.OP_LE: "vd_bool({0} <= {1})",
@@ -54,7 +55,7 @@ def source(mpc: MPC) -> str:
     """
     x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
     following, gradient = ca.SX.sym("following", mpc.nx), ca.SX.sym("Vx", mpc.nx)
-    curvature, discount = ca.SX.sym("Vxx", mpc.nx, mpc.nx), ca.SX.sym("discount")
+    curvature, discount = ca.SX.sym("Vxx", mpc.nx * (mpc.nx + 1) // 2), ca.SX.sym("discount")
     reached, cost = mpc.dynamics_function(x, u, theta), mpc.stage_function(x, u, theta)
     final = mpc.terminal_function(x, theta)
     final_hessian, final_gradient = ca.hessian(final, x)
@@ -62,12 +63,12 @@ def source(mpc: MPC) -> str:
         "gen_step": [x, u],
         "gen_final": [x],
         "gen_final_expand": [x],
-        "gen_q": [x, u, following, gradient, ca.vec(curvature), discount],
+        "gen_q": [x, u, following, gradient, curvature, discount],
     }
     outputs = {
         "gen_step": _stacked(reached, cost),
         "gen_final": _stacked(final),
-        "gen_final_expand": _stacked(final_gradient, final_hessian),
+        "gen_final_expand": _stacked(final_gradient, _triangle(final_hessian)),
         "gen_q": _action_value(reached, cost, x, u, following, gradient, curvature, discount),
     }
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
@@ -94,25 +95,39 @@ def _action_value(
 ) -> ca.SX:
     """The quadratic model of Q(x, u) = L + gamma V(f(x, u)), V expanded at the successor that the trajectory names.
 
-    Gauss-Newton: the curvature of f is left out. In the order that the kernel expects: the defect, Qx, Qu, Qxx, Qux,
-    Quu, and the regularisation directions fu'fx, fu'fu.
+    Gauss-Newton: the curvature of f is left out. In the order that the kernel expects: the defect, Qx, Qu, Qxx (upper
+    triangle), Qux, Quu.
     """
+    Vxx = _symmetric(curvature, x.numel())
     fx, fu = ca.jacobian(reached, x), ca.jacobian(reached, u)
     lxx, lx = ca.hessian(cost, x)
     luu, lu = ca.hessian(cost, u)
     defect = reached - following
-    slope = discount * (gradient + curvature @ defect)
-    weighted_fx, weighted_fu = discount * (curvature @ fx), discount * (curvature @ fu)
+    slope = discount * (gradient + Vxx @ defect)
+    weighted_fx, weighted_fu = discount * (Vxx @ fx), discount * (Vxx @ fu)
     return _stacked(
         defect,
         lx + fx.T @ slope,
         lu + fu.T @ slope,
-        lxx + fx.T @ weighted_fx,
+        _triangle(lxx + fx.T @ weighted_fx),
         ca.jacobian(lu, x) + fu.T @ weighted_fx,
         luu + fu.T @ weighted_fu,
-        fu.T @ fx,
-        fu.T @ fu,
     )
+
+
+def _triangle(matrix: ca.SX) -> ca.SX:
+    """The upper triangle of a symmetric matrix as a column, column by column."""
+    return ca.vertcat(*(matrix[i, j] for j in range(matrix.shape[1]) for i in range(j + 1)))
+
+
+def _symmetric(triangle: ca.SX, n: int) -> ca.SX:
+    """The inverse of :func:`_triangle`."""
+    matrix, k = ca.SX(n, n), 0
+    for column in range(n):
+        for row in range(column + 1):
+            matrix[row, column] = matrix[column, row] = triangle[k]
+            k += 1
+    return matrix
 
 
 def _hoisted(bodies: list[ca.SX], theta: ca.SX) -> tuple[list[ca.SX], ca.SX, ca.SX]:

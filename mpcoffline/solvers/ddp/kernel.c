@@ -7,11 +7,13 @@
  * Included after generated code that defines NX, NU, NP, NQ and the functions
  *   gen_prepare(theta, out):   what depends on theta alone [NQ]; the others take p = (theta, that)
  *   gen_step(x, u, p, out):    x+ [NX], L [1]
- *   gen_q(x, u, x_next, Vx, Vxx, gamma, p, out):  f(x, u) - x_next [NX], Qx [NX], Qu [NU], Qxx [NX*NX], Qux [NU*NX],
- *                              Quu [NU*NU], fu'fx [NU*NX], fu'fu [NU*NU]
+ *   gen_q(x, u, x_next, Vx, Vxx, gamma, p, out):  f(x, u) - x_next [NX], Qx [NX], Qu [NU], Qxx [NT], Qux [NU*NX],
+ *                              Quu [NU*NU]
  *   gen_final(x, p, out):      T [1]
- *   gen_final_expand(x, p, out): Tx [NX], Txx [NX*NX]
- * with matrices column-major.
+ *   gen_final_expand(x, p, out): Tx [NX], Txx [NT]
+ * with matrices column-major, and Vxx, Qxx, Txx as upper triangles column by column (NT = NX (NX + 1) / 2).
+ *
+ * No lane looks at another: a problem's result is the same to the bit whatever is solved next to it.
  */
 #include <stdint.h>
 #include <stdlib.h>
@@ -20,10 +22,14 @@
 enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING = -1 };
 
 #define MAX_BACKTRACKS 10
-#define MU_FIRST 1e-6
-#define MU_MIN 1e-9
-#define MU_MAX 1e8
+#define MU_FIRST 1e-3 /* regularisation relative to Quu */
+#define MU_MIN 1e-5
+#define MU_MAX 1e6
 #define ARMIJO 1e-4
+#define INPUT_TOLERANCE 3e-5
+#define RIDGE 1e-12   /* keeps a singular Quu (an input that nothing depends on) invertible */
+#define NT (NX * (NX + 1) / 2)
+#define TRI(i, j) ((j) * ((j) + 1) / 2 + (i)) /* of an upper triangle, i <= j */
 
 typedef struct {
     int64_t horizon;
@@ -42,6 +48,7 @@ typedef struct {
 } lanes;
 
 static inline vl all_lanes(void) { return vd_le(V(0.0), V(0.0)); }
+static inline vl no_lanes(void) { return (vl){0}; }
 
 static lanes *lanes_new(int64_t N) {
     lanes *w = NULL;
@@ -100,84 +107,98 @@ static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
     w->J_new = J + weight * out[0];
 }
 
-/* Cholesky factor of the free part of H (clamped rows as identity), in place; clears lanes that are not positive definite. */
+/* H = L D L' of a matrix, in place: 1/D on the diagonal, L below it. Clears lanes that are not positive definite. */
 static void factorise(vd H[NU][NU], vl *pd) {
     for (int j = 0; j < NU; ++j) {
-        vd d = H[j][j];
-        for (int l = 0; l < j; ++l) d -= H[j][l] * H[j][l];
-        vl ok = vd_lt(V(1e-14), d);
-        *pd &= ok;
-        d = vd_sqrt(vd_select(ok, d, V(1.0)));
-        H[j][j] = d;
-        for (int i = j + 1; i < NU; ++i) {
-            vd v = H[i][j];
-            for (int l = 0; l < j; ++l) v -= H[i][l] * H[j][l];
-            H[i][j] = v / d;
+        vd scaled[NU], d = H[j][j]; /* row j of L, times D */
+        for (int l = 0; l < j; ++l) {
+            scaled[l] = H[j][l];
+            H[j][l] *= H[l][l];
+            d -= H[j][l] * scaled[l];
         }
+        vl ok = vd_lt(V(0.0), d);
+        *pd &= ok;
+        H[j][j] = 1.0 / vd_select(ok, d, V(1.0));
+        for (int i = j + 1; i < NU; ++i) /* column j of L, times D, as the rows below expect it */
+            for (int l = 0; l < j; ++l) H[i][j] -= H[j][l] * H[i][l];
     }
 }
 
+/* b <- H^-1 b with the factors of H. */
 static void substitute(vd H[NU][NU], vd b[NU]) {
-    for (int i = 0; i < NU; ++i) {
+    for (int i = 0; i < NU; ++i)
         for (int l = 0; l < i; ++l) b[i] -= H[i][l] * b[l];
-        b[i] /= H[i][i];
-    }
     for (int i = NU - 1; i >= 0; --i) {
+        b[i] *= H[i][i];
         for (int l = i + 1; l < NU; ++l) b[i] -= H[l][i] * b[l];
-        b[i] /= H[i][i];
     }
 }
 
-/* min 1/2 d'Hd + g'd, low <= d <= high by an active set; returns which inputs are free and the factor of their H. */
+/* min q(d) = 1/2 d'Hd + g'd, low <= d <= high (low <= 0 <= high) by projected Newton steps from d = 0. Returns which
+ * inputs are free of their bounds and the factors of that part of H (identity elsewhere). */
 static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high[NU], vd d[NU], vl is_free[NU],
                    vd F[NU][NU], vl *pd) {
-    vl everywhere = all_lanes();
-    for (int a = 0; a < NU; ++a) { is_free[a] = everywhere; d[a] = V(0.0); }
-    for (int pass = 0; pass < 2 * NU + 1; ++pass) {
-        vd b[NU];
+    vl finished = no_lanes(), definite = all_lanes();
+    for (int i = 0; i < NU; ++i) d[i] = V(0.0);
+    for (int pass = 0; pass < 4 * NU + 4; ++pass) {
+        vd slope[NU], b[NU], trial[NU];
+        vl any_bound = no_lanes(), clipped = no_lanes();
         for (int i = 0; i < NU; ++i) {
-            b[i] = -g[i];
-            for (int j = 0; j < NU; ++j) {
-                vl both = is_free[i] & is_free[j];
-                F[i][j] = vd_select(both, H[i][j], V(i == j ? 1.0 : 0.0));
-                b[i] -= vd_select(is_free[j], V(0.0), H[i][j] * d[j]);
-            }
-            b[i] = vd_select(is_free[i], b[i], d[i]);
+            slope[i] = g[i];
+            for (int j = 0; j < NU; ++j) slope[i] += H[i][j] * d[j];
+            vl held = (vd_le(d[i], low[i]) & vd_lt(V(0.0), slope[i])) | (vd_le(high[i], d[i]) & vd_lt(slope[i], V(0.0)));
+            is_free[i] = pass ? (is_free[i] & finished) | (~held & ~finished) : ~held;
+            any_bound |= ~is_free[i];
+            b[i] = vd_select(is_free[i], -slope[i], V(0.0));
         }
-        factorise(F, pd);
+        for (int i = 0; i < NU; ++i)
+            for (int j = 0; j < NU; ++j) F[i][j] = vd_select(is_free[i] & is_free[j], H[i][j], V(i == j ? 1.0 : 0.0));
+        definite = all_lanes();
+        factorise(F, &definite);
         substitute(F, b);
-        vl changed = everywhere ^ everywhere;
         for (int i = 0; i < NU; ++i) {
-            vl outside = is_free[i] & (vd_lt(b[i], low[i]) | vd_lt(high[i], b[i]));
-            d[i] = clip(b[i], low[i], high[i]);
-            changed |= outside;
-            is_free[i] &= ~outside;
+            trial[i] = clip(d[i] + b[i], low[i], high[i]);
+            clipped |= trial[i] != d[i] + b[i];
+            if (NU == 1) is_free[i] &= ~clipped;
         }
-        if (!vl_any(changed)) {
-            /* Free again the inputs whose gradient points inwards from their bound. */
+        if (NU == 1) { /* clipping the minimiser of a parabola gives the constrained one */
+            d[0] = trial[0];
+            break;
+        }
+        /* Halve the step, along its projection, until q falls enough. */
+        vd t = V(1.0), expected = V(0.0), change = V(0.0);
+        for (int halving = 0; halving < 12; ++halving) {
+            vd fall = V(0.0);
+            expected = V(0.0);
             for (int i = 0; i < NU; ++i) {
-                vd slope = g[i];
-                for (int j = 0; j < NU; ++j) slope += H[i][j] * d[j];
-                vl inwards = (vd_le(d[i], low[i]) & vd_lt(slope, V(0.0))) | (vd_le(high[i], d[i]) & vd_lt(V(0.0), slope));
-                inwards &= ~is_free[i] & vd_lt(low[i], high[i]);
-                changed |= inwards;
-                is_free[i] |= inwards;
+                vd step_i = trial[i] - d[i], curvature = V(0.0);
+                for (int j = 0; j < NU; ++j) curvature += H[i][j] * (trial[j] - d[j]);
+                expected -= slope[i] * step_i;
+                fall -= step_i * (slope[i] + 0.5 * curvature);
             }
+            vl shorten = vd_lt(fall, 0.1 * expected) & ~finished & definite;
+            if (!vl_any(shorten)) break;
+            t = vd_select(shorten, 0.5 * t, t);
+            for (int i = 0; i < NU; ++i) trial[i] = vd_select(shorten, clip(d[i] + t * b[i], low[i], high[i]), trial[i]);
         }
-        if (!vl_any(changed) || NU == 1) break;
+        /* Done: the minimum without bounds, or a step that is small against the whole. */
+        for (int i = 0; i < NU; ++i) {
+            d[i] = vd_select(finished, d[i], trial[i]);
+            change -= g[i] * d[i];
+        }
+        finished |= ~(any_bound | clipped) | vd_le(expected, 1e-12 * change) | ~definite;
+        if (!vl_any(~finished)) break;
     }
-    for (int i = 0; i < NU; ++i)
-        for (int j = 0; j < NU; ++j) F[i][j] = vd_select(is_free[i] & is_free[j], H[i][j], V(i == j ? 1.0 : 0.0));
-    factorise(F, pd);
+    *pd &= definite;
 }
 
 /* Riccati recursion along (x, u): gains k, K, the predicted decrease of J, and where Quu was positive definite. */
 static void backward(const mpc_problem *m, lanes *w) {
-    vd Vx[NX], Vxx[NX * NX], out[NX + NX + NU + NX * NX + 2 * (NU * NX + NU * NU)];
+    vd Vx[NX], Vxx[NT], out[NX + NX + NU + NT + NU * NX + NU * NU];
     int64_t N = m->horizon;
     gen_final_expand(w->x + N * NX, w->p, out);
     for (int i = 0; i < NX; ++i) Vx[i] = out[i];
-    for (int i = 0; i < NX * NX; ++i) Vxx[i] = out[NX + i];
+    for (int i = 0; i < NT; ++i) Vxx[i] = out[NX + i];
     double weight = 1.0;
     for (int64_t k = 1; k < N; ++k) weight *= m->discount;
     vd discount = V(m->discount);
@@ -186,53 +207,53 @@ static void backward(const mpc_problem *m, lanes *w) {
     for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
         const vd *u = w->u + k * NU;
         gen_q(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
-        const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NX * NX, *Quu = Qux + NU * NX;
-        const vd *Rux = Quu + NU * NU, *Ruu = Rux + NU * NX;
+        const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NT, *Quu = Qux + NU * NX;
         for (int i = 0; i < NX; ++i) w->defect = vd_max(w->defect, vd_abs(out[i]));
-        /* Regularised as if Vxx were Vxx + mu / gamma I. */
-        vd H[NU][NU];
-        for (int a = 0; a < NU; ++a)
-            for (int b = 0; b < NU; ++b)
-                H[a][b] = Quu[b * NU + a] + w->mu * Ruu[b * NU + a] + (a == b ? w->mu * 1e-3 + 1e-12 : V(0.0));
-        vd low[NU], high[NU], d[NU], F[NU][NU];
-        vl is_free[NU];
+        /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. */
+        vd H[NU][NU], low[NU], high[NU], d[NU], F[NU][NU];
         for (int a = 0; a < NU; ++a) {
+            vd size = V(0.0);
+            for (int b = 0; b < NU; ++b) {
+                H[a][b] = Quu[b * NU + a];
+                size += vd_abs(H[a][b]);
+            }
+            H[a][a] += (w->mu + RIDGE) * size + RIDGE;
             low[a] = (k ? V(m->low[a]) : w->low0[a]) - u[a];
             high[a] = (k ? V(m->high[a]) : w->high0[a]) - u[a];
         }
+        vl is_free[NU];
         box_qp(H, Qu, low, high, d, is_free, F, &w->pd);
         vd *K = w->K + k * NU * NX;
         for (int i = 0; i < NX; ++i) {
             vd b[NU];
-            for (int a = 0; a < NU; ++a) b[a] = vd_select(is_free[a], -Qux[i * NU + a] - w->mu * Rux[i * NU + a], V(0.0));
+            for (int a = 0; a < NU; ++a) b[a] = vd_select(is_free[a], -Qux[i * NU + a], V(0.0));
             substitute(F, b);
             for (int a = 0; a < NU; ++a) K[i * NU + a] = b[a];
         }
         /* Value of the step: V <- Q(dx, d + K dx). */
-        vd QuuK[NU][NX], half = V(0.0), slope = V(0.0), Quud[NU];
+        vd half = V(0.0), slope = V(0.0), gradient[NU], M[NU][NX];
         for (int a = 0; a < NU; ++a) {
+            vd Quud = V(0.0);
+            for (int b = 0; b < NU; ++b) Quud += Quu[b * NU + a] * d[b];
             w->k[k * NU + a] = d[a];
-            Quud[a] = V(0.0);
-            for (int b = 0; b < NU; ++b) Quud[a] += Quu[b * NU + a] * d[b];
+            gradient[a] = Qu[a] + Quud;
             slope += Qu[a] * d[a];
-            half += 0.5 * d[a] * Quud[a];
+            half += 0.5 * d[a] * Quud;
             for (int i = 0; i < NX; ++i) {
-                QuuK[a][i] = V(0.0);
-                for (int b = 0; b < NU; ++b) QuuK[a][i] += Quu[b * NU + a] * K[i * NU + b];
+                M[a][i] = Qux[i * NU + a];
+                for (int b = 0; b < NU; ++b) M[a][i] += Quu[b * NU + a] * K[i * NU + b];
             }
         }
         w->predicted -= weight * (slope + half);
         for (int i = 0; i < NX; ++i) {
             Vx[i] = Qx[i];
-            for (int a = 0; a < NU; ++a) Vx[i] += K[i * NU + a] * (Quud[a] + Qu[a]) + Qux[i * NU + a] * d[a];
-        }
-        for (int i = 0; i < NX; ++i)
+            for (int a = 0; a < NU; ++a) Vx[i] += K[i * NU + a] * gradient[a] + Qux[i * NU + a] * d[a];
             for (int j = i; j < NX; ++j) {
-                vd v = Qxx[j * NX + i];
-                for (int a = 0; a < NU; ++a)
-                    v += K[i * NU + a] * (QuuK[a][j] + Qux[j * NU + a]) + Qux[i * NU + a] * K[j * NU + a];
-                Vxx[j * NX + i] = Vxx[i * NX + j] = v;
+                vd v = Qxx[TRI(i, j)];
+                for (int a = 0; a < NU; ++a) v += K[i * NU + a] * M[a][j] + Qux[i * NU + a] * K[j * NU + a];
+                Vxx[TRI(i, j)] = v;
             }
+        }
     }
 }
 
@@ -267,19 +288,33 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
 static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w, int lane, int64_t i, int64_t status,
                        int64_t iterations) {
     int64_t N = m->horizon;
-    for (int64_t k = 0; k < N * NU; ++k) b->u[i * N * NU + k] = w->u[k][lane];
-    for (int64_t k = 0; k < (N + 1) * NX; ++k) b->x[i * (N + 1) * NX + k] = w->x[k][lane];
+    double zero = w->J[lane] - w->J[lane]; /* NaN as soon as something is not finite */
+    for (int64_t k = 0; k < N * NU; ++k) {
+        b->u[i * N * NU + k] = w->u[k][lane];
+        zero += w->u[k][lane] - w->u[k][lane];
+    }
+    for (int64_t k = 0; k < (N + 1) * NX; ++k) {
+        b->x[i * (N + 1) * NX + k] = w->x[k][lane];
+        zero += w->x[k][lane] - w->x[k][lane];
+    }
     b->J[i] = w->J[lane];
     b->predicted[i] = w->predicted[lane];
-    b->status[i] = status;
+    b->status[i] = zero == 0.0 ? status : NOT_FINITE;
     b->iterations[i] = iterations;
 }
 
-/* Copies the new trajectory where the mask says so. */
+/* Takes over the new trajectory where the mask says so. */
 static void accept(const mpc_problem *m, lanes *w, vl mask) {
+    w->J = vd_select(mask, w->J_new, w->J);
+    if (!vl_any(~mask)) {
+        vd *x = w->x, *u = w->u;
+        w->x = w->x_new, w->u = w->u_new;
+        w->x_new = x, w->u_new = u;
+        return;
+    }
+    if (!vl_any(mask)) return;
     for (int64_t k = 0; k < m->horizon * NU; ++k) w->u[k] = vd_select(mask, w->u_new[k], w->u[k]);
     for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(mask, w->x_new[k], w->x[k]);
-    w->J = vd_select(mask, w->J_new, w->J);
 }
 
 /* Solves problems first, first + stride, ... of the batch; a lane that finishes takes the next one. */
@@ -288,11 +323,13 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
     if (!w) return 1;
     int64_t problem[LANES], count[LANES], next = first;
     int fresh_any, busy;
-    for (int l = 0; l < LANES; ++l) problem[l] = -1;
+    for (int l = 0; l < LANES; ++l) {
+        problem[l] = -1;
+        if (first < b->n) load_lane(m, b, w, l, first); /* lanes that get nothing to do repeat this one, ignored */
+    }
     for (;;) {
-        vl fresh = all_lanes() ^ all_lanes();
+        vl fresh = no_lanes();
         fresh_any = busy = 0;
-        int64_t spare = -1;
         for (int l = 0; l < LANES; ++l) {
             if (problem[l] < 0 && next < b->n) {
                 load_lane(m, b, w, l, problem[l] = next);
@@ -301,11 +338,9 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
                 fresh[l] = -1;
                 fresh_any = 1;
             }
-            if (problem[l] >= 0) { busy = 1; spare = problem[l]; }
+            busy |= problem[l] >= 0;
         }
         if (!busy) break;
-        for (int l = 0; l < LANES; ++l)
-            if (problem[l] < 0) load_lane(m, b, w, l, spare); /* idle lanes repeat a problem: finite numbers, ignored */
         if (fresh_any) gen_prepare(w->p, w->p + NP);
         if (fresh_any && b->cold) {
             vd J = rollout_open(m, w, w->x_new, w->u);
@@ -318,10 +353,14 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
         vl finite_J = vd_lt(vd_abs(w->J), V(INFINITY));
         /* A warm start that obeys the model is as good as a rollout, only its cost is not known before the step. */
         vl nearly = vd_lt(w->defect, V(1e-9));
-        vl small = finite_J & w->pd & vd_lt(w->predicted, m->tolerance * scale);
+        /* The cost can be flat where the policy is not: the first input must have settled too. */
+        vl settled = all_lanes();
+        for (int a = 0; a < NU; ++a)
+            settled &= vd_le(vd_abs(w->k[a]), INPUT_TOLERANCE * (1.0 + vd_abs(w->u[a])));
         /* A step found with heavy regularisation promises little without being near a solution. */
-        small &= vd_le(w->mu, V(1.0));
-        vl open = all_lanes(), moved = open ^ open;
+        settled &= w->pd & vd_le(w->mu, V(1.0));
+        vl small = finite_J & settled & vd_lt(w->predicted, m->tolerance * scale);
+        vl open = all_lanes(), moved = no_lanes();
         vd alpha = V(1.0);
         for (int trial = 0; trial < MAX_BACKTRACKS; ++trial) {
             rollout(m, w, alpha);
@@ -339,7 +378,7 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             if (problem[l] < 0) continue;
             int64_t status = RUNNING;
             ++count[l];
-            if (small[l] || (nearly[l] && moved[l] && w->pd[l] && w->mu[l] <= 1.0 &&
+            if (small[l] || (nearly[l] && moved[l] && settled[l] &&
                              w->predicted[l] < m->tolerance * (1.0 + fabs(w->J[l]))))
                 status = CONVERGED;
             else if (moved[l]) w->mu[l] = w->mu[l] * 0.2 > MU_MIN ? w->mu[l] * 0.2 : 0.0;

@@ -84,7 +84,7 @@ class DDPSolver(Solver):
         mpc: MPC,
         *,
         max_iterations: int = 200,
-        tolerance: float = 1e-10,
+        tolerance: float = 1e-11,
         n_starts: int = _LANES,
         n_threads: int = 1,
     ) -> None:

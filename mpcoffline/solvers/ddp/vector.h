@@ -36,4 +36,4 @@ LANEWISE(vd_sin, sin) LANEWISE(vd_cos, cos) LANEWISE(vd_tan, tan) LANEWISE(vd_as
 LANEWISE(vd_atan, atan) LANEWISE(vd_sinh, sinh) LANEWISE(vd_cosh, cosh) LANEWISE(vd_tanh, tanh) LANEWISE(vd_asinh, asinh)
 LANEWISE(vd_acosh, acosh) LANEWISE(vd_atanh, atanh) LANEWISE(vd_floor, floor) LANEWISE(vd_ceil, ceil) LANEWISE(vd_erf, erf)
 LANEWISE2(vd_pow, pow) LANEWISE2(vd_atan2, atan2) LANEWISE2(vd_hypot, hypot) LANEWISE2(vd_fmod, fmod)
-LANEWISE2(vd_copysign, copysign)
+LANEWISE2(vd_copysign, copysign) LANEWISE2(vd_remainder, remainder)
