@@ -144,8 +144,21 @@ class TaskResult:
             " controller's; more is better.",
             f"fit: time of the regressions; that of MPC_2 includes (VALUE, {self.value}), which MPC_3 shares.",
             "solve: mean time of one MPC in closed loop.",
+            *self._costs_by_start(),
             *(f"{name}: {n} solves failed and fell back to the previous plan." for name, n in failed.items()),
         ]
+
+    def _costs_by_start(self) -> list[str]:
+        """J from each kind of start, where there are several: the agent's own episodes start broad, for example."""
+        kinds = list(dict.fromkeys(self.starts))
+        lines = []
+        for kind in kinds if len(kinds) > 1 else []:
+            shown = []
+            for c in self.controllers:
+                costs = [cost for cost, start in zip(c.costs, self.starts, strict=True) if start == kind]
+                shown.append(f"{c.name} {sum(costs) / len(costs):.1f}")
+            lines.append(f"J from {kind} starts: {', '.join(shown)}.")
+        return lines
 
     def table(self) -> Table:
         """The table for the terminal."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,12 @@ def test_notes_tell_of_failed_solves_where_there_were_any(result: TaskResult) ->
     assert [note for note in result.notes() if "failed" in note] == [
         "MPC_2: 3 solves failed and fell back to the previous plan."
     ]
+
+
+def test_notes_split_the_cost_by_kind_of_start(result: TaskResult) -> None:
+    assert "J from hanging starts: MPC_1 500.0, MPC_2 250.0, MPC_3 125.0, reference 110.0." in result.notes()
+    same = replace(result, starts=["broad", "broad"])
+    assert not [note for note in same.notes() if note.startswith("J from")]
 
 
 def test_title_counts_the_starts(result: TaskResult) -> None:
