@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -10,6 +11,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 
 from mpcoffline.errors import MPCOfflineError
@@ -32,6 +34,7 @@ FLAGS = (
     "-march=native",
 )
 _TIMEOUT = 300.0
+_SCRATCH = ".build-"
 
 
 class CompilerError(MPCOfflineError, RuntimeError):
@@ -49,30 +52,36 @@ def compiled(source: str) -> ctypes.CDLL:
     """The shared library of a C source, compiled unless the cache has it.
 
     The key holds the source, the flags, and the compiler with the processor features that it targets. A library is
-    built in a temporary file and renamed, so that processes may build the same one at once.
+    built in a temporary folder, sealed with a digest and renamed, so that processes may build the same one at once and
+    an interrupted or damaged one is never loaded.
 
     Raises:
         CompilerError: If there is no compiler, or it fails.
     """
     compiler = find_compiler()
-    key = hashlib.sha256("\0".join([source, *FLAGS, _target(compiler)]).encode()).hexdigest()[:24]
+    flags, target = _target(compiler)
+    key = hashlib.sha256("\0".join([source, *flags, target]).encode()).hexdigest()[:24]
     folder = cache_folder()
     library = folder / f"ddp-{key}.so"
-    if library.exists():
-        try:
-            return ctypes.CDLL(str(library))
-        except OSError:  # damaged, e.g. by a full disk: build it again
-            logger.warning("Rebuilding the damaged solver %s.", library)
     try:
+        if library.exists():
+            if _is_sealed(library):
+                return ctypes.CDLL(str(library))
+            logger.warning("Rebuilding the damaged solver %s.", library)
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
-            return _built(compiler, source, Path(scratch), library)
-    except PermissionError:
-        logger.warning("The cache folder %s is read-only: this solver is compiled again in each process.", folder)
+        _remove_abandoned(folder)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=_SCRATCH) as scratch:
+            built = _build(compiler, flags, source, Path(scratch))
+            loaded = ctypes.CDLL(str(built))
+            os.replace(built, library)
+            return loaded
     except OSError as error:
-        logger.warning("The cache folder %s cannot be used (%s): compiling without it.", folder, error)
-    with tempfile.TemporaryDirectory(prefix="mpcoffline-") as scratch:
-        return _built(compiler, source, Path(scratch), None)
+        logger.warning("The cache folder %s cannot be used (%s): compiling in each process.", folder, error)
+    try:
+        with tempfile.TemporaryDirectory(prefix="mpcoffline-") as scratch:
+            return ctypes.CDLL(str(_build(compiler, flags, source, Path(scratch))))
+    except OSError as error:
+        raise _failure(compiler, str(error)) from error
 
 
 def find_compiler() -> str:
@@ -95,30 +104,55 @@ def find_compiler() -> str:
 
 
 @functools.cache
-def _target(compiler: str) -> str:
-    """The compiler's predefined macros: they name its version and every processor feature it will use."""
-    command = [compiler, "-march=native", "-dM", "-E", "-x", "c", os.devnull]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
-    if done.returncode:
-        raise _failure(compiler, done.stderr)
-    return compiler + "\n" + "\n".join(sorted(done.stdout.splitlines()))
+def _target(compiler: str) -> tuple[tuple[str, ...], str]:
+    """The flags that a compiler takes, and what it targets.
+
+    The target are its predefined macros: they name its version and every processor feature that it will use.
+    """
+    macros = ("-dM", "-E", "-x", "c", os.devnull)
+    for flags in (FLAGS, tuple(flag for flag in FLAGS if flag != "-march=native")):
+        done = _run(compiler, *(flag for flag in flags if flag.startswith("-march")), *macros)
+        if not done.returncode:
+            return flags, compiler + "\n" + "\n".join(sorted(done.stdout.splitlines()))
+    raise _failure(compiler, done.stderr)
 
 
-def _built(compiler: str, source: str, scratch: Path, library: Path | None) -> ctypes.CDLL:
-    """Compiles in a scratch folder and moves the result into the cache."""
+def _build(compiler: str, flags: tuple[str, ...], source: str, scratch: Path) -> Path:
+    """Compiles in a scratch folder and seals the result."""
     code, built = scratch / "solver.c", scratch / "solver.so"
     code.write_text(source, encoding="utf-8")
-    command = [compiler, *FLAGS, str(code), "-o", str(built), "-lm"]
+    done = _run(compiler, *flags, str(code), "-o", str(built), "-lm")
+    if done.returncode or not built.exists():
+        raise _failure(compiler, done.stderr or "no output")
+    with built.open("r+b") as file:
+        digest = hashlib.sha256(file.read()).digest()
+        file.write(digest)  # after the end of the object, where no loader looks
+    return built
+
+
+def _is_sealed(library: Path) -> bool:
+    """Whether a library is as :func:`_build` left it; loading a truncated one would crash the process."""
+    content = library.read_bytes()
+    return hashlib.sha256(content[:-32]).digest() == content[-32:]
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Removes what interrupted builds left behind more than an hour ago."""
+    for scratch in folder.glob(_SCRATCH + "*"):
+        with contextlib.suppress(OSError):
+            if time.time() - scratch.stat().st_mtime > 3600.0:
+                shutil.rmtree(scratch)
+
+
+def _run(compiler: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
+        return subprocess.run(
+            [compiler, *arguments], capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False
+        )
     except subprocess.TimeoutExpired as error:
         raise _failure(compiler, f"no result after {_TIMEOUT:.0f} s") from error
-    if done.returncode:
-        raise _failure(compiler, done.stderr)
-    if library is not None:
-        os.replace(built, library)
-        built = library
-    return ctypes.CDLL(str(built))
+    except OSError as error:  # e.g. a file that is no program
+        raise _failure(compiler, str(error)) from error
 
 
 def _failure(compiler: str, message: str) -> CompilerError:

@@ -50,6 +50,12 @@ typedef struct {
 static inline vl all_lanes(void) { return vd_le(V(0.0), V(0.0)); }
 static inline vl no_lanes(void) { return (vl){0}; }
 
+static void lanes_free(lanes *w) {
+    if (!w) return;
+    free(w->x); free(w->u); free(w->x_new); free(w->u_new); free(w->k); free(w->K);
+    free(w);
+}
+
 static lanes *lanes_new(int64_t N) {
     lanes *w = NULL;
     if (posix_memalign((void **)&w, 64, sizeof(lanes))) return NULL;
@@ -57,16 +63,14 @@ static lanes *lanes_new(int64_t N) {
     size_t sizes[6] = {(N + 1) * NX, N * NU, (N + 1) * NX, N * NU, N * NU, N * NU * NX};
     vd **fields[6] = {&w->x, &w->u, &w->x_new, &w->u_new, &w->k, &w->K};
     for (int i = 0; i < 6; ++i) {
-        if (posix_memalign((void **)fields[i], 64, sizes[i] * sizeof(vd))) return NULL;
-        memset(*fields[i], 0, sizes[i] * sizeof(vd));
+        void *memory;
+        if (posix_memalign(&memory, 64, sizes[i] * sizeof(vd))) {
+            lanes_free(w);
+            return NULL;
+        }
+        *fields[i] = memset(memory, 0, sizes[i] * sizeof(vd));
     }
     return w;
-}
-
-static void lanes_free(lanes *w) {
-    if (!w) return;
-    free(w->x); free(w->u); free(w->x_new); free(w->u_new); free(w->k); free(w->K);
-    free(w);
 }
 
 static inline vd clip(vd a, vd low, vd high) { return vd_min(vd_max(a, low), high); }
