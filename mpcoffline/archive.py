@@ -142,4 +142,5 @@ def box_from_json(data: Mapping[str, Any]) -> spaces.Box:
     )
     if dtype not in (np.float32, np.float64) or low.ndim != 1 or low.shape != high.shape or not (low <= high).all():
         raise FileFormatError("space", expected="a Box of floats with low <= high", actual=str(dict(data)))
-    return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is no bound
+        return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)

@@ -220,7 +220,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@settings(max_examples=400)
+@settings(max_examples=250)
 @given(data=st.data(), kind=st.sampled_from(["learner", "policy"]))
 def test_flipped_bytes(folder: Path, data: st.DataObject, kind: str) -> None:
     damaged = bytearray(originals()[kind])
@@ -266,7 +266,7 @@ ANYTHING = st.one_of(
 )
 
 
-@settings(max_examples=500)
+@settings(max_examples=250)
 @given(data=st.data(), kind=st.sampled_from(["learner", "policy"]))
 def test_wrong_values_in_a_valid_zip(folder: Path, data: st.DataObject, kind: str) -> None:
     """The checksums match; what is said makes no sense."""

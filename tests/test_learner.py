@@ -28,7 +28,7 @@ from mpcoffline.errors import (
     UnknownIdError,
 )
 from mpcoffline.learner import PRESETS, LearnerConfig, OfflineMPCLearner
-from mpcoffline.learning import FitConfig, ValueConfig
+from mpcoffline.learning import FitConfig, ValueConfig, ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.tasks import nominal_mpc
 
@@ -380,6 +380,14 @@ def test_saving_over_a_learner_replaces_it(tmp_path: Path) -> None:
     second = fitted(seed=2)
     second.save(tmp_path / "l.zip")
     same_fit(OfflineMPCLearner.load(tmp_path / "l.zip"), second)
+
+
+def test_a_value_function_of_other_coordinates_in_a_file_is_refused(tmp_path: Path) -> None:
+    learner = fitted()
+    learner.value_function = ValueFunction(3, (4,))
+    learner.save(tmp_path / "l.zip")
+    with pytest.raises(FileFormatError, match="value function"):
+        OfflineMPCLearner.load(tmp_path / "l.zip")
 
 
 def test_a_policys_file_is_not_a_learner(tmp_path: Path) -> None:
