@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import traceback
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 
@@ -99,27 +101,70 @@ def _run_here(fn: Callable[[Job], Result], jobs: Mapping[str, Job]) -> Iterator[
 def _run_in_processes(
     fn: Callable[[Job], Result], jobs: Mapping[str, Job], n_workers: int
 ) -> Iterator[tuple[str, Result]]:
-    """Hands each idle worker the next job; yields results as they come."""
-    waiting = deque(jobs.items())
-    workers = _start_workers(fn, n_workers)
-    busy: dict[Connection, str] = {}
-    try:
-        for connection in workers:
-            _hand_next(connection, waiting, busy)
-        while busy:
-            for ready in wait(list(busy)):
-                connection = next(c for c in busy if c is ready)
-                name = busy.pop(connection)
-                yield name, _received(name, connection, workers[connection])
+    with Workers(fn, n_workers) as workers:
+        yield from workers.run(jobs)
+
+
+class Workers(Generic[Job, Result]):
+    """Processes that apply a function to jobs, round after round; :func:`map` is one round.
+
+    Each process unpickles ``fn`` once: a callable object can keep what is expensive to build between jobs.
+
+    Args:
+        fn: What to do with a job; it is pickled.
+        n: Number of processes.
+    """
+
+    def __init__(self, fn: Callable[[Job], Result], n: int) -> None:
+        self._workers = _start_workers(fn, n)
+        # Also runs when the object is forgotten, and when the interpreter ends.
+        self._stop = weakref.finalize(self, _end_all, self._workers)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def run(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Result]]:
+        """Hands each idle worker the next job; yields names and results as they come.
+
+        An error, Ctrl-C, or a consumer that stops early ends all workers.
+
+        Raises:
+            JobError: If a job raises or its process dies.
+        """
+        waiting = deque(jobs.items())
+        busy: dict[Connection, str] = {}
+        complete = False
+        try:
+            for connection in self._workers:
                 _hand_next(connection, waiting, busy)
-        for connection in workers:
+            while busy:
+                for ready in wait(list(busy)):
+                    connection = next(c for c in busy if c is ready)
+                    name = busy.pop(connection)
+                    yield name, _received(name, connection, self._workers[connection])
+                    _hand_next(connection, waiting, busy)
+            complete = True
+        finally:
+            if not complete:
+                _stop(self._workers.values())
+
+    def close(self) -> None:
+        """Ends the processes: idle ones in good order, others at once."""
+        self._stop()
+
+
+def _end_all(workers: dict[Connection, multiprocessing.context.SpawnProcess]) -> None:
+    for connection in workers:
+        with suppress(OSError):  # it may have died
             connection.send(None)
-        for process in workers.values():
-            process.join(_JOIN_TIMEOUT)
-    finally:  # an error, or Ctrl-C: nothing stays behind
-        _stop(workers.values())
-        for connection in workers:
-            connection.close()
+    for process in workers.values():
+        process.join(_JOIN_TIMEOUT)
+    _stop(workers.values())
+    for connection in workers:
+        connection.close()
 
 
 def _start_workers(fn: Callable[[Any], Any], n_workers: int) -> dict[Connection, multiprocessing.context.SpawnProcess]:
@@ -170,7 +215,7 @@ def _work(fn: Callable[[Any], Any], connection: Connection) -> None:
                 outcome = _Outcome(None, _described(error), traceback.format_exc())
             try:
                 connection.send(outcome)
-            except (TypeError, AttributeError, ValueError) as error:  # a result that cannot be pickled
+            except (pickle.PicklingError, TypeError, AttributeError, ValueError) as error:  # cannot be pickled
                 connection.send(_Outcome(None, _described(error), traceback.format_exc()))
 
 

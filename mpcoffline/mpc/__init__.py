@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .component import StageCost, TerminalCost
+from .constraints import Constraint, Penalty, StateBounds
 from .cost import NormCost, QuadraticCost
 from .model import Model
 from .parameters import Block, Parameter, ParameterSpace
@@ -11,11 +12,14 @@ from .problem import MPC
 __all__ = [
     "MPC",
     "Block",
+    "Constraint",
     "Model",
     "NormCost",
     "Parameter",
     "ParameterSpace",
+    "Penalty",
     "QuadraticCost",
     "StageCost",
+    "StateBounds",
     "TerminalCost",
 ]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Integral, Real
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -15,12 +15,11 @@ from numpy.typing import ArrayLike
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import StageCost, TerminalCost
+from .constraints import Constraint, Constraints, Sizes, StateBounds, constraints_from_json, fitted_constraints
 from .cost import cost_from_json
-from .expressions import function_from_json, function_to_json, traced
+from .expressions import traced
 from .model import Model
 from .parameters import Array, Group, ParameterSpace
-
-Constraints = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +41,12 @@ class MPC:
         discount: gamma, in (0, 1].
         action_low: Lower bounds of the inputs, ``(nu,)``; ``-inf`` where there are none.
         action_high: Upper bounds, ``(nu,)``.
-        constraints: ``(x, u, p) -> h`` with h <= 0 at every stage, a CasADi column; ``p`` as in the model.
+        constraints: ``(x, u, p) -> h`` with h <= 0 at every stage, a CasADi column, ``p`` as in the model; or a list of
+            :class:`Constraint` and :class:`StateBounds`, which are named, may be soft, and may hold at the end only.
 
     Raises:
         InvalidArgumentError: For a non-positive horizon, a discount outside (0, 1], bounds that cross or have the wrong
-            shape, or costs that do not fit the model's dimensions.
+            shape, or costs and constraints that do not fit the model's dimensions.
     """
 
     model: Model
@@ -56,7 +56,7 @@ class MPC:
     discount: float
     action_low: ArrayLike
     action_high: ArrayLike
-    constraints: Constraints | ca.Function | None = field(default=None, repr=False)
+    constraints: Constraints | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         horizon, discount = _positive_integer("horizon", self.horizon), _discount(self.discount)
@@ -67,7 +67,7 @@ class MPC:
         object.__setattr__(self, "discount", discount)
         object.__setattr__(self, "action_low", low)
         object.__setattr__(self, "action_high", high)
-        object.__setattr__(self, "constraints", self._constraint_function())
+        object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
         _ = self.stage_function, self.terminal_function  # dimensions are refused here, not at the first solve
 
     def _bounds(self, name: str) -> Array:
@@ -132,6 +132,39 @@ class MPC:
         }
         return replace(self, **parts)
 
+    def theta_along(self, values: Mapping[str, ArrayLike]) -> Array:
+        """One theta a stage, for time-varying references, prices, weights or models.
+
+        Args:
+            values: By parameter name, one value a stage in its natural shape: ``(N, *shape)``, or ``(N + 1, *shape)``.
+                Stage N is the terminal cost's; where it is not given, the last value is held. A value without leading
+                dimension is constant.
+
+        Returns:
+            Theta ``(1, N + 1, size)`` for ``solve(..., theta=...)``; all other parameters are those of this problem.
+
+        Raises:
+            UnknownIdError: For a name that no parameter has.
+            InvalidArgumentError: For a wrong shape, a matrix that is not PSD, or a value out of bounds.
+        """
+        n = self.horizon
+        shapes = {block.name: block.shape for block in self.space}
+        along: dict[str, Array] = {}
+        for name, value in values.items():
+            array, shape = np.asarray(value, dtype=np.float64), shapes.get(name, np.shape(value))
+            if array.shape == (n, *shape):
+                array = np.concatenate([array, array[-1:]])
+            elif array.shape == shape:
+                array = np.broadcast_to(array, (n + 1, *shape))
+            if array.shape != (n + 1, *shape):
+                raise InvalidArgumentError(
+                    name, expected=f"shape {shape}, {(n, *shape)} or {(n + 1, *shape)}", actual=f"shape {array.shape}"
+                )
+            along[name] = array
+        return np.stack([self.space.pack({name: array[k] for name, array in along.items()}) for k in range(n + 1)])[
+            None
+        ]
+
     def replace(self, **changes: Any) -> Self:
         """The same problem with other fields, e.g. ``mpc.replace(horizon=20, discount=0.95)``."""
         return replace(self, **changes)
@@ -161,43 +194,42 @@ class MPC:
 
     @cached_property
     def constraint_function(self) -> ca.Function | None:
-        """h_theta as CasADi function ``(x, u, theta) -> h``, or None."""
-        if self.constraints is None:
+        """h_theta, the hard constraints of the stages 0 ... N - 1, as CasADi ``(x, u, theta) -> h``, or None."""
+        hard = [self.constraint_expression(c) for c in self.constraints_at("stages") if c.soft is None]
+        if not hard:
             return None
         x, u, theta = self._symbols()
-        h = self.constraints(x, u, self._part("model", theta))
+        h = ca.vertcat(*(expression(x, u, theta) for expression in hard))
         return ca.Function("h", [x, u, theta], [h], ["x", "u", "theta"], ["h"])
+
+    def constraints_at(self, place: Literal["stages", "end"]) -> list[Constraint]:
+        """The constraints of the stages 0 ... N - 1, or of the end; state bounds are in neither."""
+        given = self.constraints if isinstance(self.constraints, tuple) else ()
+        return [c for c in given if isinstance(c, Constraint) and c.terminal == (place == "end")]
+
+    @property
+    def state_bounds(self) -> list[StateBounds]:
+        """The bounds of x_1 ... x_N."""
+        given = self.constraints if isinstance(self.constraints, tuple) else ()
+        return [c for c in given if isinstance(c, StateBounds)]
+
+    def constraint_expression(self, constraint: Constraint) -> Callable[..., ca.SX]:
+        """One of the constraints as ``(x, u, theta) -> h``, or ``(x, theta) -> h`` at the end."""
+        return lambda *arguments: constraint.function(*arguments[:-1], self._part("model", arguments[-1]))
 
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         size = sum(component.space.size for component in self._components().values())
         return ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu), ca.SX.sym("theta", size)
 
-    def _constraint_function(self) -> ca.Function | None:
-        """The user's callable as a CasADi function of (x, u, flat model parameters)."""
-        if self.constraints is None or isinstance(self.constraints, ca.Function):
-            return self.constraints
-        x, u, p = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu), ca.SX.sym("p", self.model.space.size)
-        try:
-            h = ca.densify(ca.SX(self.constraints(x, u, self.model.space.symbols(p))))
-        except (TypeError, NotImplementedError, RuntimeError) as error:
-            raise InvalidArgumentError(
-                "constraints",
-                expected="a function of CasADi SX expressions",
-                actual=f"{type(error).__name__}: {error}",
-            ) from error
-        if h.shape[1] != 1:
-            raise InvalidArgumentError("constraints", expected="a column", actual=f"shape {h.shape}")
-        return traced("constraints", ca.Function("constraints", [x, u, p], [h]))
-
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description from which :meth:`from_json` rebuilds the problem."""
-        constraints = self.constraints
+        constraints = self.constraints if isinstance(self.constraints, tuple) else None
         return {name: component.to_json() for name, component in self._components().items()} | {
             "horizon": self.horizon,
             "discount": self.discount,
             "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],
             "action_high": [_finite_or_none(v) for v in np.asarray(self.action_high)],
-            "constraints": function_to_json(constraints) if isinstance(constraints, ca.Function) else None,
+            "constraints": None if constraints is None else [constraint.to_json() for constraint in constraints],
         }
 
     @classmethod
@@ -209,10 +241,6 @@ class MPC:
         """
         try:
             model = Model.from_json(data["model"])
-            constraints = None
-            if data["constraints"] is not None:
-                sizes = (model.nx, model.nu, model.space.size)
-                constraints = function_from_json(data["constraints"], "constraints", inputs=sizes)
             return cls(
                 model=model,
                 stage_cost=cost_from_json(data["stage_cost"]),
@@ -221,12 +249,16 @@ class MPC:
                 discount=data["discount"],
                 action_low=[-np.inf if v is None else v for v in data["action_low"]],
                 action_high=[np.inf if v is None else v for v in data["action_high"]],
-                constraints=constraints,
+                constraints=constraints_from_json(data["constraints"], _sizes(model)),
             )
         except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             if isinstance(error, FileFormatError):
                 raise
             raise FileFormatError("MPC", expected="the JSON form of an MPC", actual=repr(error)) from error
+
+
+def _sizes(model: Model) -> Sizes:
+    return Sizes(model.nx, model.nu, model.space)
 
 
 def _positive_integer(name: str, value: object) -> int:

@@ -1,0 +1,233 @@
+"""Constraints of (MPC) besides input bounds: named, hard or soft, along the horizon or at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, cast
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
+
+from .expressions import function_from_json, function_to_json, traced
+from .parameters import Array, ParameterSpace
+
+ConstraintFunction = Callable[..., ca.SX]  # (x, u, p) -> h; (x, p) -> h at the end of the horizon
+
+
+class Penalty(NamedTuple):
+    """What it costs to violate a soft constraint by s = max(h, 0): ``l1 sum(s) + l2 sum(s^2)``, discounted like L.
+
+    An ``l1`` above the largest multiplier of the hard constraint is exact: where the hard problem is feasible, the soft
+    one has the same solution. ``l2`` alone is smooth, and always violates a little.
+
+    Attributes:
+        l1: Weight of the violation.
+        l2: Weight of its square.
+    """
+
+    l1: float = 0.0
+    l2: float = 0.0
+
+
+class Sizes(NamedTuple):
+    """What a constraint must fit: numbers of states and inputs, and the parameters of the model."""
+
+    nx: int
+    nu: int
+    parameters: ParameterSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """h_theta(x, u) <= 0 of (MPC) at the stages 0 ... N - 1, or h_theta(x_N) <= 0.
+
+    Args:
+        function: ``(x, u, p) -> h``, with ``terminal=True`` ``(x, p) -> h``: a CasADi column whose elements must not
+            be positive; ``p`` holds the model's parameters.
+        name: What a violated constraint is called in a solution's status.
+        soft: None for a hard constraint, else the price of violating it.
+        terminal: Whether it holds at the end of the horizon.
+
+    Raises:
+        InvalidArgumentError: For an empty name, or a penalty that is negative or zero altogether.
+    """
+
+    function: ConstraintFunction | ca.Function
+    name: str = "constraints"
+    soft: Penalty | None = None
+    terminal: bool = False
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        object.__setattr__(self, "soft", _checked_penalty(self.name, self.soft))
+
+    def fitted(self, sizes: Sizes) -> Constraint:
+        """The constraint with its function traced by CasADi.
+
+        Raises:
+            InvalidArgumentError: For a function that is not one of CasADi SX expressions, or is not a column.
+        """
+        symbols = [ca.SX.sym("x", sizes.nx), ca.SX.sym("u", sizes.nu), ca.SX.sym("p", sizes.parameters.size)]
+        arguments = symbols[::2] if self.terminal else symbols
+        expected = [symbol.numel() for symbol in arguments]
+        if isinstance(self.function, ca.Function):
+            found = [self.function.numel_in(i) for i in range(self.function.n_in())]
+            if found != expected or self.function.n_out() != 1 or self.function.size2_out(0) != 1:
+                raise InvalidArgumentError(
+                    self.name, expected=f"a function of inputs of sizes {expected} to a column", actual=str(found)
+                )
+            return self
+        try:
+            h = ca.densify(ca.SX(self.function(*arguments[:-1], sizes.parameters.symbols(arguments[-1]))))
+        except (TypeError, NotImplementedError, RuntimeError) as error:
+            raise InvalidArgumentError(
+                self.name, expected="a function of CasADi SX expressions", actual=f"{type(error).__name__}: {error}"
+            ) from error
+        if h.shape[1] != 1 or h.shape[0] == 0:
+            raise InvalidArgumentError(self.name, expected="a column", actual=f"shape {h.shape}")
+        return replace(self, function=traced(self.name, ca.Function("h", arguments, [h])))
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description of a fitted constraint."""
+        return {
+            "kind": "Constraint",
+            "name": self.name,
+            "soft": None if self.soft is None else list(self.soft),
+            "terminal": self.terminal,
+            "function": function_to_json(cast(ca.Function, self.function)),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class StateBounds:
+    """Low <= x_k <= high for k = 1 ... N; the initial state is given, so it is not asked.
+
+    Args:
+        low: Lower bounds, ``(nx,)``; ``-inf`` where there are none.
+        high: Upper bounds, ``(nx,)``.
+        name: What it is called in a solution's status.
+        soft: None for hard bounds, else the price of violating them.
+
+    Raises:
+        InvalidArgumentError: For bounds that cross or are of different shapes.
+    """
+
+    low: ArrayLike
+    high: ArrayLike
+    name: str = "state bounds"
+    soft: Penalty | None = None
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        object.__setattr__(self, "soft", _checked_penalty(self.name, self.soft))
+        low, high = (np.atleast_1d(np.array(bound, dtype=np.float64)) for bound in (self.low, self.high))
+        if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
+            raise InvalidArgumentError(self.name, expected="low <= high of one shape", actual=f"{low} and {high}")
+        object.__setattr__(self, "low", low)
+        object.__setattr__(self, "high", high)
+
+    def fitted(self, sizes: Sizes) -> StateBounds:
+        """The bounds, if they are as many as states.
+
+        Raises:
+            InvalidArgumentError: If they are not.
+        """
+        if np.shape(self.low) != (sizes.nx,):
+            raise InvalidArgumentError(
+                self.name, expected=f"{sizes.nx} numbers, one a state", actual=f"shape {np.shape(self.low)}"
+            )
+        return self
+
+    def expression(self, x: ca.SX) -> ca.SX:
+        """The bounds that exist as a column h <= 0."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        above = [x[i] - float(high[i]) for i in np.flatnonzero(np.isfinite(high)).tolist()]
+        return ca.vertcat(*above, *(float(low[i]) - x[i] for i in np.flatnonzero(np.isfinite(low)).tolist()))
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description; infinite bounds become null."""
+        return {
+            "kind": "StateBounds",
+            "name": self.name,
+            "soft": None if self.soft is None else list(self.soft),
+            "low": _finite_or_none(np.asarray(self.low)),
+            "high": _finite_or_none(np.asarray(self.high)),
+        }
+
+
+AnyConstraint = Constraint | StateBounds
+Constraints = ConstraintFunction | AnyConstraint | Sequence[AnyConstraint]
+
+
+def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[AnyConstraint, ...] | None:
+    """The constraints of an MPC as a tuple, checked against its sizes; None where there are none.
+
+    Raises:
+        InvalidArgumentError: For something else than constraints, names that occur twice, or sizes that do not fit.
+    """
+    if given is None:
+        return None
+    if isinstance(given, Constraint | StateBounds):
+        given = (given,)
+    elif callable(given):
+        given = (Constraint(given),)
+    elif not isinstance(given, Sequence):
+        raise InvalidArgumentError("constraints", expected="constraints", actual=repr(given))
+    for constraint in given:
+        if not isinstance(constraint, Constraint | StateBounds):
+            raise InvalidArgumentError(
+                "constraints",
+                expected="a function (x, u, p) -> h, or a list of Constraint and StateBounds",
+                actual=f"a list with {constraint!r}",
+            )
+    names = [constraint.name for constraint in given]
+    if len(set(names)) < len(names):
+        raise InvalidArgumentError("names of constraints", expected="unique names", actual=str(names))
+    return tuple(constraint.fitted(sizes) for constraint in given) or None
+
+
+def constraints_from_json(data: Sequence[Mapping[str, Any]] | None, sizes: Sizes) -> tuple[AnyConstraint, ...] | None:
+    """The inverse of ``to_json`` of each.
+
+    Raises:
+        FileFormatError: If the data are damaged.
+    """
+    if data is None:
+        return None
+    if not isinstance(data, list) or not data:
+        raise FileFormatError("constraints", expected="a list of constraints, or null", actual=repr(data)[:200])
+    return tuple(_from_json(entry, sizes) for entry in data)
+
+
+def _from_json(data: Mapping[str, Any], sizes: Sizes) -> AnyConstraint:
+    kind, name = data["kind"], data["name"]
+    soft = None if data["soft"] is None else Penalty(*map(float, data["soft"]))
+    if kind == "StateBounds":
+        low = [-np.inf if v is None else float(v) for v in data["low"]]
+        return StateBounds(low, [np.inf if v is None else float(v) for v in data["high"]], name, soft)
+    if kind != "Constraint" or not isinstance(data["terminal"], bool):
+        raise FileFormatError("constraint", expected="a Constraint or StateBounds", actual=repr(kind))
+    inputs = (sizes.nx, sizes.parameters.size) if data["terminal"] else (sizes.nx, sizes.nu, sizes.parameters.size)
+    return Constraint(function_from_json(data["function"], name, inputs=inputs), name, soft, data["terminal"])
+
+
+def _check_name(name: object) -> None:
+    if not isinstance(name, str) or not name:
+        raise InvalidArgumentError("name of a constraint", expected="a text", actual=repr(name))
+
+
+def _checked_penalty(name: str, penalty: Penalty | None) -> Penalty | None:
+    if penalty is None:
+        return None
+    weights = Penalty(*penalty)
+    if not all(np.isfinite(w) and w >= 0.0 for w in weights) or sum(weights) == 0.0:
+        raise InvalidArgumentError(f"{name}.soft", expected="weights >= 0, one of them positive", actual=str(penalty))
+    return Penalty(float(weights.l1), float(weights.l2))
+
+
+def _finite_or_none(values: Array) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
