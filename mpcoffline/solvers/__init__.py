@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import warnings
 from typing import Any
 
-from mpcoffline.errors import UnknownIdError
+from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC
 
 from .ddp import CompilerError, DDPSolver
 from .interface import Plan, Solution, Solver
+from .lqr import LQRSolver
 from .nlp import IpoptSolver
 
-__all__ = ["SOLVERS", "CompilerError", "DDPSolver", "IpoptSolver", "Plan", "Solution", "Solver", "make_solver"]
+__all__ = [
+    "SOLVERS",
+    "CompilerError",
+    "DDPSolver",
+    "IpoptSolver",
+    "LQRSolver",
+    "Plan",
+    "Solution",
+    "Solver",
+    "make_solver",
+]
 
 logger = logging.getLogger(__name__)
 
-SOLVERS: dict[str, type[Solver]] = {"ddp": DDPSolver, "ipopt": IpoptSolver}
+# In the order in which "auto" tries them: the fastest first.
+SOLVERS: dict[str, type[Solver]] = {"lqr": LQRSolver, "ddp": DDPSolver, "ipopt": IpoptSolver}
 
 
 def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
@@ -25,8 +38,9 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
 
     Args:
         mpc: The problem.
-        name: ``"ddp"`` (generated C, input bounds only, hundreds of times faster), ``"ipopt"`` (any smooth problem),
-            or ``"auto"`` for the fastest that supports the problem; the log says which, and why not a faster one.
+        name: ``"lqr"`` (linear model, quadratic costs, input bounds: exact), ``"ddp"`` (input bounds only; generated C,
+            hundreds of times faster than ipopt), ``"ipopt"`` (any smooth problem), or ``"auto"`` for the fastest that
+            supports the problem and has the options given; its ``reason`` and the log say why not a faster one.
         **options: Options of that solver's constructor.
 
     Returns:
@@ -34,26 +48,58 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
 
     Raises:
         UnknownIdError: For an unknown name.
-        InvalidArgumentError: If the solver named does not support the problem.
+        InvalidArgumentError: If the solver named does not support the problem, or for an option that it has not.
         CompilerError: If ``"ddp"`` is named and there is no working C compiler; ``"auto"`` warns and takes ipopt.
     """
     if name == "auto":
         return _fastest(mpc, options)
     if name not in SOLVERS:
         raise UnknownIdError.of("solver", name, ["auto", *SOLVERS])
+    if unknown := _unknown_options(name, options):
+        raise InvalidArgumentError(
+            f"options of the {name} solver", expected=f"some of {', '.join(_options(name))}", actual=", ".join(unknown)
+        )
     return SOLVERS[name](mpc, **options)
 
 
 def _fastest(mpc: MPC, options: dict[str, Any]) -> Solver:
-    """The fastest solver that supports the problem."""
-    if mpc.constraints is not None:
-        logger.info("Solver: ipopt, as ddp supports no constraints other than input bounds.")
-        return IpoptSolver(mpc, **options)
-    try:
-        solver = DDPSolver(mpc, **options)
-    except CompilerError as error:
-        # The warnings module shows the same text once.
-        warnings.warn(f"Solving with ipopt, which is about 500 times slower than ddp: {error}", stacklevel=3)
-        return IpoptSolver(mpc)
-    logger.info("Solver: ddp.")
-    return solver
+    """The first of :data:`SOLVERS` that supports the problem."""
+    known = {option for name in SOLVERS for option in _options(name)}
+    if not options.keys() <= known:
+        raise InvalidArgumentError(
+            "options of the solvers", expected=f"some of {', '.join(sorted(known))}", actual=", ".join(options)
+        )
+    refusals: list[str] = []
+    no_compiler = ""
+    for name, solver_class in SOLVERS.items():
+        if unknown := _unknown_options(name, options):
+            refusals.append(f"{name} has no option {', '.join(unknown)}")
+            continue
+        try:
+            solver = solver_class(mpc, **options)
+        except CompilerError as error:
+            no_compiler = str(error)
+            refusals.append(f"{name} has no compiler")
+            options = {key: value for key, value in options.items() if key in _options("ipopt")}
+        except InvalidArgumentError as error:
+            if error.name in options or name == "ipopt":
+                raise
+            refusals.append(f"{name} does not support {error.actual}")
+        else:
+            if no_compiler and name == "ipopt":  # the warnings module shows the same text once
+                text = f"Solving with ipopt, which is about 500 times slower than ddp: {no_compiler}"
+                warnings.warn(text, stacklevel=3)
+            solver.reason = f"{name} is the fastest that fits" + "".join(f"; {refusal}" for refusal in refusals)
+            logger.info("Solver: %s.", solver.reason)
+            return solver
+    raise InvalidArgumentError("options", expected="options of one solver", actual="; ".join(refusals))
+
+
+def _options(name: str) -> list[str]:
+    """The options of a solver's constructor."""
+    parameters = inspect.signature(SOLVERS[name].__init__).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+
+
+def _unknown_options(name: str, options: dict[str, Any]) -> list[str]:
+    return [option for option in options if option not in _options(name)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,10 +58,11 @@ class Solution:
         x: State trajectories, ``(B, N + 1, nx)``.
         u: Input trajectories, ``(B, N, nu)``.
         value: V_theta(s), or Q_theta(s, a) where ``u0`` was given, ``(B,)``.
-        success: Whether the trajectory was checked to be a solution: it obeys model and bounds, and the solver's
-            optimality test passed. ``(B,)``
-        status: The solver's own words, one a problem.
-        stats: Figures of the call: ``iterations`` ``(B,)`` and ``time`` in s.
+        success: Whether the trajectory was checked to be a solution, whatever the algorithm said of itself: it obeys
+            model, bounds and constraints, and the conditions of an optimum hold. ``(B,)``
+        status: In words, one a problem: how it was solved, or what is wrong (e.g. the constraint that is violated).
+        stats: Figures of the call: ``iterations`` ``(B,)``, ``time`` in s, and what the solver adds, e.g. the
+            ``residual`` ``(B,)`` of the conditions of an optimum.
     """
 
     u0: Array
@@ -88,9 +89,17 @@ class Solver(ABC):
 
     Args:
         mpc: The problem. Its parameters are the default ``theta``; another theta never rebuilds the solver.
+
+    Attributes:
+        mpc: The problem.
+        name: What :func:`make_solver` calls it.
+        theta_dimensions: Which forms of theta it takes: 1 ``(size,)``, 2 ``(B, size)``, 3 ``(B, N + 1, size)``.
+        reason: Why :func:`make_solver` chose it; empty where it was named.
     """
 
     name: str
+    theta_dimensions: ClassVar[tuple[int, ...]] = (1,)
+    reason: str = ""
 
     def __init__(self, mpc: MPC) -> None:
         self.mpc = mpc
@@ -106,7 +115,9 @@ class Solver(ABC):
 
         Args:
             x: Initial states, ``(B, nx)`` or ``(nx,)``.
-            theta: Parameters, ``(size,)``; the MPC's own by default.
+            theta: Parameters, ``(size,)``; the MPC's own by default. Solvers whose ``theta_dimensions`` say so also
+                take one theta a problem, ``(B, size)``, and one a problem and stage, ``(B, N + 1, size)`` or
+                ``(1, N + 1, size)``: time-varying references, prices, models, see :meth:`MPC.theta_along`.
             u0: First inputs that are imposed, ``(B, nu)`` or ``(nu,)``.
             warm_start: A plan near the solution (an earlier solution, shifted); rows of NaN start cold.
 
@@ -119,7 +130,7 @@ class Solver(ABC):
         """
         states = _checked("x", x, self.mpc.nx)
         imposed = None if u0 is None else self._checked_inputs(u0, len(states))
-        parameters = self.mpc.theta if theta is None else self.mpc.space.checked(theta)
+        parameters = self.mpc.theta if theta is None else self._checked_theta(theta, len(states))
         plan = warm_start.plan if isinstance(warm_start, Solution) else warm_start
         if plan is not None:
             template = Plan.none(len(states), self.mpc)
@@ -143,7 +154,25 @@ class Solver(ABC):
 
     @abstractmethod
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
-        """Solves the batch; arguments are checked, ``x`` is ``(B, nx)``."""
+        """Solves the batch; arguments are checked, ``x`` is ``(B, nx)``, theta ``(size,)`` or has B rows."""
+
+    def _checked_theta(self, theta: ArrayLike, n_problems: int) -> Array:
+        array, space = np.asarray(theta, dtype=np.float64), self.mpc.space
+        if array.ndim not in self.theta_dimensions or array.ndim == 1:
+            if array.ndim in (2, 3):
+                raise InvalidArgumentError(
+                    "theta",
+                    expected=f"shape ({space.size},) for the {self.name} solver",
+                    actual=f"shape {array.shape}",
+                    hint="The ipopt solver takes a theta for each problem and stage.",
+                )
+            return space.checked(array)
+        shape = (n_problems, *(() if array.ndim == 2 else (self.mpc.horizon + 1,)), space.size)
+        if array.shape not in (shape, (1, *shape[1:])):
+            raise InvalidArgumentError("theta", expected=f"shape {shape}", actual=f"shape {array.shape}")
+        for row in array.reshape(-1, space.size):
+            space.checked(row)
+        return np.broadcast_to(array, shape)
 
     def _checked_inputs(self, u0: ArrayLike, n_problems: int) -> Array:
         inputs = _checked("u0", u0, self.mpc.nu)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -12,10 +14,13 @@ from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, Plan, Solution, Solver
+from .linear_quadratic import is_affine
 from .starts import N_CANDIDATES, candidate_inputs
+from .transcription import Multipliers, Transcription
+from .workers import WorkerPool
 
-_FEASIBILITY_TOLERANCE = 1e-6
-_CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+_FEASIBILITY_TOLERANCE = 1e-6  # of the size of the states
+_OPTIMALITY_TOLERANCE = 1e-6  # of the size of the terms of the gradient
 
 
 class IpoptSolver(Solver):
@@ -26,63 +31,162 @@ class IpoptSolver(Solver):
     polishes the best with the exact Hessian. A warm start goes to the exact Hessian at once. The starting points are
     fixed by a seed at construction, so that equal calls give equal results.
 
+    What is returned is the model run with the inputs found, within their bounds, and what that costs. ``success`` says
+    that this trajectory violates no constraint and that the first-order conditions hold at it
+    (``stats["residual"]``), whatever ipopt returned. Otherwise ``status`` says what is wrong, e.g.
+    ``"Infeasible_Problem_Detected: 'speed limit' at stage 3 is violated by 0.2"``.
+
     Args:
         mpc: The problem.
         n_starts: Starting points of a cold solve; 1 suffices where the model is linear (the default there).
         tolerance: ipopt's relative convergence tolerance.
         max_iterations: Bound on the iterations of each ipopt call.
+        n_workers: Processes that share a batch (CasADi's threads crash with ipopt). They start with the first batch,
+            which takes seconds, and end with the solver; results do not depend on their number.
     """
 
     name = "ipopt"
+    theta_dimensions = (1, 2, 3)
 
     def __init__(
-        self, mpc: MPC, *, n_starts: int | None = None, tolerance: float = 1e-8, max_iterations: int = 300
+        self,
+        mpc: MPC,
+        *,
+        n_starts: int | None = None,
+        tolerance: float = 1e-8,
+        max_iterations: int = 300,
+        n_workers: int = 1,
     ) -> None:
         super().__init__(mpc)
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
+        for name, value in (("max_iterations", max_iterations), ("n_workers", n_workers)):
+            if value < 1:
+                raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
         self._n_starts = n_starts or (1 if is_linear(mpc) else 4)
-        nlp = _nonlinear_program(mpc)
-        common = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
-        warm = {"warm_start_init_point": "yes", "mu_init": 1e-4}
-        gauss_newton = {"hess_lag": _cost_curvature(nlp)}
-        self._cold = _ipopt("cold", nlp, common, gauss_newton)
-        self._exact = _ipopt("exact", nlp, common | warm, {})
-        self._n_constraints = nlp["g"].numel() // mpc.horizon - mpc.nx
-        self._rollout = _rollout_function(mpc)
+        self._options: dict[str, Any] = {
+            "n_starts": self._n_starts,
+            "tolerance": tolerance,
+            "max_iterations": max_iterations,
+        }
         self._candidates = candidate_inputs(mpc)
+        self._pool = WorkerPool(mpc, self._options, n_workers) if n_workers > 1 else None
+        if self._pool is None:
+            _ = self._common  # built here, not at the first solve
+
+    @cached_property
+    def _common(self) -> _Program:
+        """The program of one theta for all stages."""
+        return _Program(self.mpc, self._candidates, **self._options)
+
+    @cached_property
+    def _stagewise(self) -> _Program:
+        """The program of one theta a stage."""
+        return _Program(self.mpc, self._candidates, **self._options, stagewise=True)
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
         start = time.perf_counter()
-        known = warm_start.known
-        rows = []
-        for i, state in enumerate(x):
-            imposed = None if u0 is None else u0[i]
-            guess = (warm_start.x[i], warm_start.u[i]) if known[i] else None
-            rows.append(self._solve_one(state, theta, imposed, guess))
-        xs, us, values, success, status, iterations = zip(*rows, strict=True)
-        u = np.stack(us)
-        stats = {"iterations": np.array(iterations), "time": time.perf_counter() - start}
-        return Solution(u[:, 0].copy(), np.stack(xs), u, np.array(values), np.array(success), list(status), stats)
+        if self._pool is not None and len(x) > 1:
+            found = self._pool.solve(x, theta, u0, warm_start)
+        else:
+            found = self.solve_each(x, theta, u0, warm_start)
+        u = np.stack([one.u for one in found])
+        stats: dict[str, Any] = {
+            "iterations": np.array([one.iterations for one in found]),
+            "time": time.perf_counter() - start,
+            "residual": np.array([one.residual for one in found]),
+            "violation": np.array([one.violation for one in found]),
+        }
+        success, values = np.array([one.success for one in found]), np.array([one.value for one in found])
+        trajectories = np.stack([one.x for one in found])
+        return Solution(u[:, 0].copy(), trajectories, u, values, success, [one.status for one in found], stats)
 
-    def _solve_one(
-        self, state: Array, theta: Array, u0: Array | None, guess: tuple[Array, Array] | None
-    ) -> tuple[Array, Array, float, bool, str, int]:
+    def solve_each(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
+        """Solves the problems one after the other in this process; arguments as checked by :meth:`solve`."""
+        program = self._stagewise if theta.ndim == 3 else self._common
+        known = warm_start.known
+        return [
+            program.solve(
+                state,
+                theta if theta.ndim == 1 else theta[i],
+                None if u0 is None else u0[i],
+                (warm_start.x[i], warm_start.u[i]) if known[i] else None,
+            )
+            for i, state in enumerate(x)
+        ]
+
+    def close(self) -> None:
+        """Ends the worker processes, if there are any; a later batch starts them again."""
+        if self._pool is not None:
+            self._pool.close()
+
+
+def is_linear(mpc: MPC) -> bool:
+    """Whether f_theta is affine in (x, u) and only inputs are bounded, so that with convex costs minima are global."""
+    return mpc.constraints is None and is_affine(mpc)
+
+
+@dataclass(frozen=True)
+class Found:
+    """One problem's solution.
+
+    Attributes:
+        x: ``(N + 1, nx)``.
+        u: ``(N, nu)``.
+        value: The objective.
+        success: Whether the trajectory passed all tests.
+        status: ipopt's word, and what is wrong.
+        iterations: Of ipopt, all starts together.
+        residual: Of the first-order conditions, relative.
+        violation: Of the constraint that is violated most; 0 where all hold.
+    """
+
+    x: Array
+    u: Array
+    value: float
+    success: bool
+    status: str
+    iterations: int
+    residual: float
+    violation: float
+
+
+class _Program:
+    """The compiled program: one for the Gauss-Newton, one for the exact Hessian."""
+
+    def __init__(
+        self,
+        mpc: MPC,
+        candidates: Array,
+        *,
+        n_starts: int,
+        tolerance: float,
+        max_iterations: int,
+        stagewise: bool = False,
+    ) -> None:
+        self._mpc, self._candidates, self._n_starts = mpc, candidates, n_starts
+        self._problem = Transcription(mpc, stagewise)
+        common = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
+        warm = {"warm_start_init_point": "yes", "mu_init": 1e-4}
+        self._cold = _ipopt("cold", self._problem, common, {"hess_lag": _cost_curvature(self._problem)})
+        self._exact = _ipopt("exact", self._problem, common | warm, {})
+
+    def solve(self, state: Array, theta: Array, u0: Array | None, guess: tuple[Array, Array] | None) -> Found:
         """One problem: warm from a guess if that works, else cold from several starts and polished."""
         iterations = 0
+        p = np.r_[state, theta.ravel()]  # theta (N + 1, size) by rows is CasADi's (size, N + 1) by columns
         if guess is not None:
-            result = self._call(self._exact, state, theta, u0, guess)
-            iterations = result[-1]
-            if result[3]:
-                return result
-        attempts = [self._call(self._cold, state, theta, u0, g) for g in self._starts(state, theta, u0)]
-        iterations += sum(attempt[-1] for attempt in attempts)
-        best = min(attempts, key=lambda attempt: (not attempt[3], attempt[2]))
-        polished = self._call(self._exact, state, theta, u0, (best[0], best[1]))
-        iterations += polished[-1]
-        if polished[3] and polished[2] <= best[2] + 1e-6 * (1.0 + abs(best[2])):
+            warm = self._call(self._exact, p, u0, guess)
+            if warm.success:
+                return warm
+            iterations = warm.iterations
+        attempts = [self._call(self._cold, p, u0, start) for start in self._starts(state, theta, u0)]
+        best = min(attempts, key=lambda attempt: (not attempt.success, attempt.violation, attempt.value))
+        polished = self._call(self._exact, p, u0, (best.x, best.u))
+        iterations += sum(attempt.iterations for attempt in [*attempts, polished])
+        if polished.success and (not best.success or polished.value <= best.value + 1e-6 * (1.0 + abs(best.value))):
             best = polished
-        return (*best[:-1], iterations)
+        return replace(best, iterations=iterations)
 
     def _starts(self, state: Array, theta: Array, u0: Array | None) -> list[tuple[Array, Array]]:
         """The ``n_starts`` cheapest of the candidate input sequences, with the states that they lead to."""
@@ -90,125 +194,62 @@ class IpoptSolver(Solver):
         if u0 is not None:
             inputs[:, 0] = u0
         n, horizon, nu = inputs.shape
-        states, costs = self._rollout(state, inputs.reshape(n * horizon, nu).T, theta)
-        trajectories = states.full().T.reshape(n, horizon, self.mpc.nx)
+        along = np.broadcast_to(theta, (horizon + 1, theta.shape[-1])).T
+        states, costs = self._problem.rollout_candidates(state, inputs.reshape(n * horizon, nu).T, along)
+        trajectories = states.full().T.reshape(n, horizon, self._mpc.nx)
         cost = np.nan_to_num(costs.full().ravel(), nan=np.inf, posinf=np.inf)
         order = np.argsort(cost, kind="stable")[: self._n_starts]
-        first = np.broadcast_to(state, (1, self.mpc.nx))
+        first = np.broadcast_to(state, (1, self._mpc.nx))
         return [
             (np.concatenate([first, trajectories[i]]), inputs[i]) for i in order if np.isfinite(trajectories[i]).all()
         ] or [(np.repeat(first, horizon + 1, axis=0), np.zeros((horizon, nu)))]
 
-    def _call(
-        self, solver: ca.Function, state: Array, theta: Array, u0: Array | None, guess: tuple[Array, Array]
-    ) -> tuple[Array, Array, float, bool, str, int]:
-        """One run of ipopt: states, inputs, value, checked success, status, iterations."""
-        mpc = self.mpc
-        low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
-        lower = np.full((mpc.horizon, mpc.nu + mpc.nx), -np.inf)
-        upper = -lower
-        lower[:, : mpc.nu], upper[:, : mpc.nu] = low, high
-        if u0 is not None:
-            lower[0, : mpc.nu] = upper[0, : mpc.nu] = u0
-        h_low = np.r_[np.zeros(mpc.nx), np.full(self._n_constraints, -np.inf)]
-        result = solver(
-            x0=np.hstack([guess[1], guess[0][1:]]).ravel(),
-            lbx=lower.ravel(),
-            ubx=upper.ravel(),
-            lbg=np.tile(h_low, mpc.horizon),
-            ubg=0.0,
-            p=np.r_[state, theta],
-        )
+    def _call(self, solver: ca.Function, p: Array, u0: Array | None, guess: tuple[Array, Array]) -> Found:
+        """One run of ipopt, and the tests of what it returned."""
+        problem, mpc = self._problem, self._mpc
+        low, high = problem.bounds(u0)
+        start = problem.pack(*guess, p)
+        result = solver(x0=start, lbx=low, ubx=high, lbg=problem.constraint_low, ubg=0.0, p=p)
         stats = solver.stats()
-        w = result["x"].full().reshape(mpc.horizon, mpc.nu + mpc.nx)
-        u = np.clip(w[:, : mpc.nu], low, high)  # ipopt relaxes bounds by 1e-8
-        x = np.vstack([state, w[:, mpc.nu :]])
-        violation = np.abs(result["g"].full()).ravel()
-        if self._n_constraints:
-            violation = np.maximum(result["g"].full().ravel(), 0.0)
-            violation = np.r_[violation, np.abs(self._dynamics_residual(x, u, theta))]
-        scale = 1.0 + float(np.abs(x).max(initial=0.0))
-        feasible = bool(np.isfinite(w).all() and violation.max() <= _FEASIBILITY_TOLERANCE * scale)
+        w = result["x"].full().ravel()
+        planned, u = problem.unpack(w)
+        u = np.clip(u, np.asarray(mpc.action_low), np.asarray(mpc.action_high))  # ipopt relaxes bounds by 1e-8
+        simulated = problem.simulate(u.T, p).full().T
+        followed = bool(np.isfinite(simulated).all())
+        x = np.vstack([p[: mpc.nx], simulated if followed else planned])
+        point = problem.pack(x, u, p)
+        value = float(problem.appraise(point, p)[0])
+        violation, where = problem.violation(point, p)
+        multipliers = Multipliers(result["lam_x"].full().ravel(), result["lam_g"].full().ravel())
+        residual = problem.optimality(point, p, u0, multipliers)
         status = str(stats["return_status"])
-        success = feasible and status in _CONVERGED
-        return x, u, float(result["f"]), success, status, int(stats["iter_count"])
-
-    def _dynamics_residual(self, x: Array, u: Array, theta: Array) -> Array:
-        reached = self.mpc.dynamics_function(x[:-1].T, u.T, theta).full().T
-        return np.asarray(reached - x[1:]).ravel()
-
-
-def is_linear(mpc: MPC) -> bool:
-    """Whether f_theta is affine in (x, u), so that with convex costs every minimum is global."""
-    x, u = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu)
-    theta = ca.SX.sym("theta", mpc.space.size)
-    z = ca.vertcat(x, u)
-    jacobian = ca.jacobian(mpc.dynamics_function(x, u, theta), z)
-    return mpc.constraints is None and not ca.depends_on(jacobian, z)
+        scale = 1.0 + float(np.abs(x).max())
+        if not (followed and np.isfinite(value)):
+            failure = "the model run with the inputs found is not finite"
+        elif not violation <= _FEASIBILITY_TOLERANCE * scale:
+            failure = f"{where} is violated by {violation:.3g}"
+        elif not residual <= _OPTIMALITY_TOLERANCE:
+            failure = f"not optimal, the first-order conditions leave {residual:.1e}"
+        else:
+            failure = ""
+        words = f"{status}: {failure}" if failure else status
+        return Found(x, u, value, not failure, words, int(stats["iter_count"]), residual, violation)
 
 
-def _nonlinear_program(mpc: MPC) -> dict[str, ca.SX]:
-    """(MPC) with decision variables (u_0, x_1, u_1, ..., x_N), parameters (s, theta)."""
-    state, theta = ca.SX.sym("s", mpc.nx), ca.SX.sym("theta", mpc.space.size)
-    f, stage, terminal, h = (
-        mpc.dynamics_function,
-        mpc.stage_function,
-        mpc.terminal_function,
-        mpc.constraint_function,
-    )
-    x, cost, variables, constraints = state, ca.SX(0), [], []
-    for k in range(mpc.horizon):
-        u, x_next = ca.SX.sym(f"u{k}", mpc.nu), ca.SX.sym(f"x{k + 1}", mpc.nx)
-        cost += mpc.discount**k * stage(x, u, theta)
-        variables += [u, x_next]
-        constraints.append(f(x, u, theta) - x_next)
-        if h is not None:
-            constraints.append(h(x, u, theta))
-        x = x_next
-    cost += mpc.discount**mpc.horizon * terminal(x, theta)
-    return {
-        "x": ca.vertcat(*variables),
-        "f": cost,
-        "g": ca.vertcat(*constraints),
-        "p": ca.vertcat(state, theta),
-    }
-
-
-def _cost_curvature(nlp: dict[str, ca.SX]) -> ca.Function:
+def _cost_curvature(problem: Transcription) -> ca.Function:
     """The Gauss-Newton Hessian for ipopt: the curvature of the cost, without that of the constraints."""
-    hessian, _ = ca.hessian(nlp["f"], nlp["x"])
-    cost_factor, multipliers = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", nlp["g"].numel())
+    hessian, _ = ca.hessian(problem.cost, problem.variables)
+    cost_factor, multipliers = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", problem.constraints.numel())
     return ca.Function(
         "nlp_hess_l",
-        [nlp["x"], nlp["p"], cost_factor, multipliers],
+        [problem.variables, problem.parameters, cost_factor, multipliers],
         [ca.triu(cost_factor * hessian)],
         ["x", "p", "lam_f", "lam_g"],
         ["triu_hess_gamma_x_x"],
     )
 
 
-def _ipopt(name: str, nlp: dict[str, ca.SX], options: dict[str, Any], extra: dict[str, Any]) -> ca.Function:
-    quiet = {"print_time": False, "show_eval_warnings": False, "record_time": False}
+def _ipopt(name: str, problem: Transcription, options: dict[str, Any], extra: dict[str, Any]) -> ca.Function:
+    quiet = {"print_time": False, "show_eval_warnings": False, "record_time": False, "calc_lam_p": False}
+    nlp = {"x": problem.variables, "f": problem.cost, "g": problem.constraints, "p": problem.parameters}
     return ca.nlpsol(name, "ipopt", nlp, quiet | {"ipopt": options} | extra)
-
-
-def _rollout_function(mpc: MPC) -> ca.Function:
-    """``(s, inputs (nu, K*N), theta) -> states (nx, K*N), costs (1, K)``: the model run open loop from one state."""
-    u, theta = ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
-    # The running cost is carried along as one more state: (x, J, gamma^k).
-    carried = ca.SX.sym("carried", mpc.nx + 2)
-    state, total, weight = carried[: mpc.nx], carried[mpc.nx], carried[mpc.nx + 1]
-    stepped = ca.vertcat(
-        mpc.dynamics_function(state, u, theta),
-        total + weight * mpc.stage_function(state, u, theta),
-        weight * mpc.discount,
-    )
-    step = ca.Function("step", [carried, u, theta], [stepped])
-    horizon = step.mapaccum("rollout", mpc.horizon)
-    s, inputs = ca.MX.sym("s", mpc.nx), ca.MX.sym("u", mpc.nu, mpc.horizon)
-    p = ca.MX.sym("theta", mpc.space.size)
-    path = horizon(ca.vertcat(s, 0, 1), inputs, ca.repmat(p, 1, mpc.horizon))
-    last = path[:, -1]
-    cost = last[mpc.nx] + last[mpc.nx + 1] * mpc.terminal_function(last[: mpc.nx], p)
-    one = ca.Function("one", [s, inputs, p], [path[: mpc.nx, :], cost])
-    return one.map("all", "serial", N_CANDIDATES, [0, 2], [])

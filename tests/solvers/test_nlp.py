@@ -14,9 +14,9 @@ from scipy.optimize import minimize
 
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.envs.linear_tracking import A0, ACTION_WEIGHT, B0, STATE_WEIGHT, plant_matrices
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, QuadraticCost
-from mpcoffline.solvers import IpoptSolver, Plan, Solution, make_solver
+from mpcoffline.solvers import IpoptSolver, Plan, Solution
 from mpcoffline.solvers.nlp import is_linear
 from mpcoffline.tasks import nominal_mpc
 
@@ -108,11 +108,11 @@ def test_the_nominal_cost_would_not_do() -> None:
 def test_q_value_is_at_least_the_value(env_id: str, horizon: int) -> None:
     """Q_th(s, a) >= V_th(s), with equality at the solution. ipopt's relative tolerance 1e-8, times the value's size."""
     solver = solver_of(env_id, horizon)
-    x = states_of(env_id, 12)
+    x = states_of(env_id, 8)
     solution = solver.solve(x)
     assert solution.success.all()
     tolerance = 1e-6 * (1.0 + np.abs(solution.value))
-    for seed in range(3):
+    for seed in range(2):
         q = solver.q_value(x, actions_of(solver.mpc, len(x), seed))
         assert (q >= solution.value - tolerance).all()
         assert (q > solution.value + 1e-3).any()
@@ -406,18 +406,6 @@ def test_float32_actions_may_touch_their_bounds() -> None:
     touching = np.float32([0.1])  # 0.10000000149
     assert float(touching[0]) > 0.1
     assert IpoptSolver(mpc).solve([1.0], u0=touching).u0[0] == pytest.approx(0.1, abs=1e-12)
-
-
-def test_make_solver() -> None:
-    mpc = integrator()
-    assert make_solver(mpc).name == "ddp"
-    assert make_solver(mpc, "ipopt", n_starts=2).name == "ipopt"
-    assert make_solver(integrator(constraints=rate_limit)).name == "ipopt"
-    with pytest.raises(UnknownIdError, match="Did you mean 'ipopt'"):
-        make_solver(mpc, "ipop")
-    for n_starts in (0, -1, 65):
-        with pytest.raises(InvalidArgumentError, match="n_starts: expected from 1 to 64"):
-            make_solver(mpc, n_starts=n_starts)
 
 
 def test_which_problems_are_linear() -> None:

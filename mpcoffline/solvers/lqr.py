@@ -1,0 +1,237 @@
+"""LQRSolver: linear model, quadratic costs; the Riccati recursion, and a QP where input bounds are active."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from typing import Any
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.mpc import MPC
+
+from .interface import Array, Plan, Solution, Solver
+from .linear_quadratic import Extraction, LinearQuadratic, Riccati, misfit
+from .nlp import IpoptSolver
+
+_TOLERANCE = 1e-8
+_INFINITE = 1e30  # daqp's
+_UPPER, _LOWER = 1, 3  # daqp's marks of a bound that is active from the start
+_SETTINGS = {"primal_tol": 1e-11, "dual_tol": 1e-12, "iter_limit": 10_000}
+_REASONS = {-1: "infeasible", -2: "cycling", -3: "unbounded", -4: "iteration limit", -5: "not convex"}
+
+
+class LQRSolver(Solver):
+    """The exact solution of linear-quadratic problems, in numpy.
+
+    For each theta the discounted Riccati recursion is run once and kept; a batch of problems is then one matrix
+    product. Where that solution leaves the input bounds, a QP in the departures from it is solved by daqp, a dual
+    active-set method, which finds the active bounds and with them the exact solution; a warm start says which bounds
+    to try first. ``success`` says that the first-order conditions hold along the trajectory, which is decisive as the
+    problem is convex; ``stats["residual"]`` says how well, relative to the size of their terms.
+
+    A theta whose Hessian with respect to the inputs is singular or indefinite at some stage (inputs free of cost
+    that also change nothing that costs) has no unique solution: its problems are passed on to ipopt, and
+    their status says so.
+
+    References: discounted Riccati recursion: Bertsekas, "Dynamic Programming and Optimal Control", vol. 1; QP:
+    Arnstroem, Bemporad, Axehill, "A dual active-set solver for embedded quadratic programming using recursive LDL'
+    updates", IEEE TAC 67(8), 2022.
+
+    Args:
+        mpc: The problem: a model that is affine in (x, u), quadratic stage and terminal costs, no constraints but
+            input bounds.
+        cache_size: Number of thetas whose recursion is kept.
+
+    Raises:
+        InvalidArgumentError: For another structure; the message says what does not fit.
+    """
+
+    name = "lqr"
+    theta_dimensions = (1, 2, 3)
+
+    def __init__(self, mpc: MPC, *, cache_size: int = 8) -> None:
+        super().__init__(mpc)
+        if (reason := misfit(mpc)) is not None:
+            raise InvalidArgumentError(
+                "mpc",
+                expected="a linear-quadratic problem for the lqr solver",
+                actual=reason,
+                hint='Use make_solver(mpc, "auto").',
+            )
+        if cache_size < 1:
+            raise InvalidArgumentError("cache_size", expected="a positive integer", actual=str(cache_size))
+        self._extraction = Extraction(mpc)
+        self._low, self._high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
+        self._cache: OrderedDict[bytes, _Controller] = OrderedDict()
+        self._cache_size = cache_size
+        self._ipopt: IpoptSolver | None = None
+
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
+        start = time.perf_counter()
+        if theta.ndim == 1:
+            solution = self._solve_with(theta, x, u0, warm_start)
+        else:
+            solution = self._solve_each(theta, x, u0, warm_start)
+        solution.stats["time"] = time.perf_counter() - start
+        return solution
+
+    def _solve_each(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan) -> Solution:
+        """Problems with thetas of their own, those with equal ones together."""
+        _, group = np.unique(theta.reshape(len(theta), -1), axis=0, return_inverse=True)
+        result = _empty(len(x), self.mpc)
+        for k in range(group.max() + 1):
+            rows = np.flatnonzero(group == k)
+            warm = Plan(warm_start.x[rows], warm_start.u[rows])
+            _put(result, rows, self._solve_with(theta[rows[0]], x[rows], None if u0 is None else u0[rows], warm))
+        return result
+
+    def _solve_with(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan) -> Solution:
+        """The problems of one theta, ``(size,)`` or ``(N + 1, size)``."""
+        controller = self._controller(theta)
+        if not controller.definite(u0 is not None):
+            return self._by_ipopt(theta, x, u0, warm_start, "no unique solution by Riccati")
+        solution = controller.solve(x, u0, warm_start)
+        lost = np.flatnonzero(~solution.success)
+        if len(lost):
+            warm = Plan(warm_start.x[lost], warm_start.u[lost])
+            reason = solution.status[lost[0]]
+            _put(solution, lost, self._by_ipopt(theta, x[lost], None if u0 is None else u0[lost], warm, reason))
+        return solution
+
+    def _by_ipopt(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan, reason: str) -> Solution:
+        if self._ipopt is None:
+            self._ipopt = IpoptSolver(self.mpc)
+        every = theta if theta.ndim == 1 else theta[None]
+        solution = self._ipopt.solve(x, every, u0, warm_start)
+        solution.status[:] = [f"ipopt, as {reason}: {status}" for status in solution.status]
+        return solution
+
+    def _controller(self, theta: Array) -> _Controller:
+        key = theta.tobytes()
+        if key not in self._cache:
+            self._cache[key] = _Controller(self._extraction(theta), self._low, self._high)
+            if len(self._cache) > self._cache_size:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
+
+
+class _Controller:
+    """What is computed once a theta."""
+
+    def __init__(self, problem: LinearQuadratic, low: Array, high: Array) -> None:
+        self._problem, self._low, self._high = problem, low, high
+        self._free = Riccati(problem)
+        self._rest: Riccati | None = None
+        self._programs: dict[bool, _BoundedInputs] = {}
+
+    def definite(self, imposed: bool) -> bool:
+        """Whether the recursion went through; with the first input imposed, as far as the second stage."""
+        return self._riccati(imposed).definite
+
+    def _riccati(self, imposed: bool) -> Riccati:
+        if not imposed:
+            return self._free
+        if self._rest is None:
+            self._rest = Riccati(self._problem.tail())
+        return self._rest
+
+    def solve(self, x: Array, u0: Array | None, warm_start: Plan) -> Solution:
+        """The problems from ``x (B, nx)``; with ``u0 (B, nu)`` given, the rest of them from its successor."""
+        problem, imposed = self._problem, u0 is not None
+        riccati, skipped = self._riccati(imposed), int(imposed)
+        begin = x if u0 is None else x @ problem.A[0].T + u0 @ problem.B[0].T + problem.c[0]
+        states, inputs = riccati.trajectories(begin)
+        value, residual = riccati.value(begin), riccati.residual(begin)
+        iterations, status = np.zeros(len(x), dtype=np.int64), ["Riccati"] * len(x)
+        rows = np.flatnonzero(((inputs < self._low) | (inputs > self._high)).any(axis=(1, 2)))
+        if len(rows):
+            program, rest = self._program(imposed, riccati), riccati.problem
+            for i in rows:
+                guess = warm_start.u[i, skipped:]
+                states[i], inputs[i], iterations[i], status[i] = program.solve(states[i], inputs[i], guess)
+            bounded = states[rows], inputs[rows]
+            value[rows] = rest.cost(*bounded)
+            residual[rows] = rest.optimality(*bounded, rest.costates(*bounded), self._low, self._high)
+        success = np.isfinite(value) & (residual <= _TOLERANCE)
+        for i in np.flatnonzero(~success):
+            status[i] = f"{status[i]} left a residual of {residual[i]:.1e}"
+        if u0 is not None:
+            z = np.concatenate([x, u0], axis=1)
+            stage = np.einsum("bi,ij,bj->b", z, problem.H[0], z) + 2.0 * z @ problem.h[0] + problem.offset[0]
+            value = stage + problem.discount * value
+            states = np.concatenate([x[:, None], states], axis=1)
+            inputs = np.concatenate([u0[:, None], inputs], axis=1)
+        else:
+            states[:, 0] = x
+        stats: dict[str, Any] = {"iterations": iterations, "residual": residual}
+        return Solution(inputs[:, 0].copy(), states, inputs, value, success, status, stats)
+
+    def _program(self, imposed: bool, riccati: Riccati) -> _BoundedInputs:
+        if imposed not in self._programs:
+            self._programs[imposed] = _BoundedInputs(*riccati.responses, self._low, self._high)
+        return self._programs[imposed]
+
+
+class _BoundedInputs:
+    """The QP min |w|^2 with low <= u + G w <= high, u being the inputs without bounds.
+
+    Args:
+        F: What w adds to the states, ``((N + 1) nx, N nu)``, see :attr:`Riccati.responses`.
+        G: What w adds to the inputs, ``(N nu, N nu)``.
+        low: ``(nu,)``.
+        high: ``(nu,)``.
+    """
+
+    def __init__(self, F: Array, G: Array, low: Array, high: Array) -> None:
+        n = len(G)
+        self._F, self._G, self._low, self._high = F, G, low, high
+        self._model = daqp.Model()
+        self._model.settings = _SETTINGS
+        wide = np.full(n, _INFINITE)
+        # Whether daqp copies what it is given or points to it: all of it lives as long as this object.
+        self._data = (np.eye(n), np.zeros(n), np.ascontiguousarray(G), wide, -wide, np.zeros(n, dtype=np.intc))
+        self._model.setup(*self._data)
+
+    def solve(self, x: Array, u: Array, guess: Array) -> tuple[Array, Array, int, str]:
+        """States, inputs, iterations and status of the best inputs within the bounds.
+
+        Args:
+            x: The states without bounds, ``(N + 1, nx)``.
+            u: The inputs without bounds, ``(N, nu)``.
+            guess: Inputs of a plan ``(N, nu)``, whose active bounds are tried first; NaN for none.
+        """
+        sense = np.zeros(u.size, dtype=np.intc)
+        sense[(guess >= self._high).ravel()] = _UPPER
+        sense[(guess <= self._low).ravel()] = _LOWER
+        upper = np.minimum(self._high - u, _INFINITE).ravel()
+        lower = np.maximum(self._low - u, -_INFINITE).ravel()
+        self._model.update(bupper=upper, blower=lower, sense=sense)
+        w, _, flag, info = self._model.solve()
+        iterations = int(info["iterations"])
+        if flag <= 0 or not np.isfinite(w).all():
+            return x, u, iterations, f"daqp ({_REASONS.get(flag, flag)})"
+        inputs = u + (self._G @ w).reshape(u.shape)
+        # What the clipping moves, within the tolerance of the QP, is checked as a residual of the dynamics.
+        return x + (self._F @ w).reshape(x.shape), np.clip(inputs, self._low, self._high), iterations, "QP"
+
+
+def _empty(n: int, mpc: MPC) -> Solution:
+    plan = Plan.none(n, mpc)
+    stats: dict[str, NDArray[Any]] = {"iterations": np.zeros(n, dtype=np.int64), "residual": np.zeros(n)}
+    u0, value, success = np.empty((n, mpc.nu)), np.empty(n), np.zeros(n, dtype=bool)
+    return Solution(u0, plan.x, plan.u, value, success, [""] * n, stats)
+
+
+def _put(target: Solution, rows: NDArray[np.intp], part: Solution) -> None:
+    """Writes the solution of some problems into that of all."""
+    for name in ("u0", "x", "u", "value", "success"):
+        getattr(target, name)[rows] = getattr(part, name)
+    for name in ("iterations", "residual"):
+        target.stats[name][rows] = part.stats[name]
+    for row, status in zip(rows, part.status, strict=True):
+        target.status[row] = status
