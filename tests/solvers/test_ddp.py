@@ -322,3 +322,16 @@ def test_theta_is_data() -> None:
     np.testing.assert_array_equal(given.value, own.value)
     changed = mpc.replace(horizon=7, discount=0.99, action_low=[-1.0], action_high=[0.5])
     check(DDPSolver(changed), x, DDPSolver(changed).solve(x))
+
+
+def test_each_problem_may_have_its_own_theta() -> None:
+    """Cold, warm and mixed: each row is what it is with its theta alone."""
+    solver = solver_of(PENDULUM)
+    x = random_states(PENDULUM, 7)
+    theta = np.stack([random_theta(solver.mpc, seed) for seed in range(7)])
+    cold = solver.solve(x, theta)
+    warm = solver.solve(x + 0.01, theta, warm_start=cold)
+    mixed = solver.solve(x + 0.01, theta, warm_start=cold.plan.select(np.arange(7) < 3))
+    for i in range(7):
+        np.testing.assert_array_equal(solver.solve(x[i], theta[i]).u, cold.u[i])
+        np.testing.assert_array_equal(mixed.u[i], (warm if i < 3 else solver.solve(x + 0.01, theta[i])).u[i])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
@@ -78,6 +79,7 @@ class DDPSolver(Solver):
     """
 
     name = "ddp"
+    theta_dimensions = (1, 2)
 
     def __init__(
         self,
@@ -116,23 +118,24 @@ class DDPSolver(Solver):
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
         start = time.perf_counter()
         known = warm_start.known
-        if known.all():
+        n_known = np.count_nonzero(known)
+        if n_known == len(x):
             result = self._run(x, theta, u0, warm_start)
-        elif not known.any():
+        elif n_known == 0:
             result = self._run(x, theta, u0, None)
         else:
             result = self._run_mixed(x, theta, u0, warm_start, known)
         # A warm start can lead nowhere; such a problem gets the cold solve that it would have had without.
         lost = known & (result["status"] > 1)
-        if lost.any():
-            again = self._run(x[lost], theta, None if u0 is None else u0[lost], None)
+        if np.count_nonzero(lost):
+            again = self._run(x[lost], _rows(theta, lost), None if u0 is None else u0[lost], None)
             for name, array in again.items():
                 result[name][lost] = array
         status = result["status"]
         stats: dict[str, Any] = {"iterations": result["iterations"], "time": time.perf_counter() - start}
         stats["predicted_decrease"] = result["predicted"]
         success = (status == 0) & np.isfinite(result["J"])
-        words = [_STATUS[code] for code in status]
+        words = [_STATUS[code] for code in status.tolist()]
         return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], success, words, stats)
 
     def _run_mixed(
@@ -141,7 +144,7 @@ class DDPSolver(Solver):
         """Warm and cold problems of one batch, solved apart and put together in order."""
         merged: dict[str, NDArray[Any]] = {}
         for chosen, warm in ((known, Plan(plan.x[known], plan.u[known])), (~known, None)):
-            part = self._run(x[chosen], theta, None if u0 is None else u0[chosen], warm)
+            part = self._run(x[chosen], _rows(theta, chosen), None if u0 is None else u0[chosen], warm)
             for name, array in part.items():
                 merged.setdefault(name, np.empty((len(x), *array.shape[1:]), array.dtype))[chosen] = array
         return merged
@@ -149,59 +152,64 @@ class DDPSolver(Solver):
     def _run(self, x: Array, theta: Array, u0: Array | None, plan: Plan | None) -> dict[str, NDArray[Any]]:
         """Calls the kernel; warm with a plan, cold without."""
         n, mpc = len(x), self.mpc
-        states = np.ascontiguousarray(x)
-        parameters = np.ascontiguousarray(np.broadcast_to(theta, (n, len(theta))))
-        imposed = None if u0 is None else np.ascontiguousarray(u0)
-        if plan is None:
-            trajectories = np.empty((n, mpc.horizon + 1, mpc.nx))
-            inputs = np.empty((n, mpc.horizon, mpc.nu))
+        shapes = {
+            "x": (n, mpc.horizon + 1, mpc.nx),
+            "u": (n, mpc.horizon, mpc.nu),
+            "J": (n,),
+            "predicted": (n,),
+            "x0": (n, mpc.nx),
+            "theta": (n, theta.shape[-1]),
+            "u0": (n, mpc.nu),
+        }
+        block, address = _block(shapes)
+        block["x0"][:], block["theta"][:] = x, theta
+        if u0 is None:
+            address["u0"] = None
         else:
-            trajectories, inputs = (np.array(part, dtype=np.float64, order="C") for part in plan)
-        J, predicted = np.empty(n), np.empty(n)
-        iterations, status = np.empty(n, np.int64), np.empty(n, np.int64)
-        batch = _Batch(
-            n,
-            states.ctypes.data,
-            parameters.ctypes.data,
-            None if imposed is None else imposed.ctypes.data,
-            trajectories.ctypes.data,
-            inputs.ctypes.data,
-            J.ctypes.data,
-            predicted.ctypes.data,
-            iterations.ctypes.data,
-            status.ctypes.data,
-            0,
-        )
-        workers = min(self._n_threads, -(-n // _LANES) if plan is not None else n)
-
-        def work(first: int) -> int:
-            problem = ctypes.byref(self._problem)
-            if plan is not None:
-                return int(self._library.mpc_solve(problem, ctypes.byref(batch), first, workers))
-            return int(
-                self._library.mpc_solve_cold(
-                    problem,
-                    ctypes.byref(batch),
-                    self._candidates.ctypes.data,
-                    len(self._candidates),
-                    self._n_starts,
-                    first,
-                    workers,
-                )
-            )
-
-        if workers == 1:
-            failed = work(0)
-        else:
-            with ThreadPoolExecutor(workers) as pool:  # ctypes releases the interpreter lock
-                failed = sum(pool.map(work, range(workers)))
+            block["u0"][:] = u0
+        if plan is not None:
+            block["x"][:], block["u"][:] = plan
+        counts = np.empty((2, n), np.int64)
+        where = counts.ctypes.data
+        batch = _Batch(n=n, iterations=where, status=where + counts.strides[0], **address)
+        failed = self._call(batch, cold=plan is None)
         if failed:
             raise MemoryError(f"solving {n} MPCs: the kernel could not allocate its work space")
-        return {
-            "x": trajectories,
-            "u": inputs,
-            "J": J,
-            "predicted": predicted,
-            "iterations": iterations,
-            "status": status,
-        }
+        result: dict[str, NDArray[Any]] = {name: block[name] for name in ("x", "u", "J", "predicted")}
+        return result | {"iterations": counts[0], "status": counts[1]}
+
+    def _call(self, batch: _Batch, *, cold: bool) -> int:
+        """Runs the kernel on a batch, in several threads if there are; returns how many failed."""
+        library, problem, arguments = self._library, ctypes.byref(self._problem), ctypes.byref(batch)
+        workers = min(self._n_threads, batch.n if cold else -(-batch.n // _LANES))
+
+        def work(first: int) -> int:
+            if not cold:
+                return int(library.mpc_solve(problem, arguments, first, workers))
+            starts = self._candidates.ctypes.data, len(self._candidates), self._n_starts
+            return int(library.mpc_solve_cold(problem, arguments, *starts, first, workers))
+
+        if workers == 1:
+            return work(0)
+        with ThreadPoolExecutor(workers) as pool:  # ctypes releases the interpreter lock
+            return sum(pool.map(work, range(workers)))
+
+
+def _rows(theta: Array, chosen: NDArray[np.bool_]) -> Array:
+    """The thetas of the chosen problems, or the one of all."""
+    return theta[chosen] if theta.ndim == 2 else theta
+
+
+def _block(shapes: dict[str, tuple[int, ...]]) -> tuple[dict[str, Array], dict[str, int | None]]:
+    """Arrays of doubles in one piece of memory, and their addresses: for one problem, allocations would take long."""
+    sizes = [math.prod(shape) for shape in shapes.values()]
+    memory = np.empty(sum(sizes))
+    start = memory.ctypes.data
+    arrays: dict[str, Array] = {}
+    addresses: dict[str, int | None] = {}
+    offset = 0
+    for (name, shape), size in zip(shapes.items(), sizes, strict=True):
+        arrays[name] = memory[offset : offset + size].reshape(shape)
+        addresses[name] = start + 8 * offset
+        offset += size
+    return arrays, addresses
