@@ -212,7 +212,8 @@ def _from_json(data: Mapping[str, Any], sizes: Sizes) -> AnyConstraint:
     if kind != "Constraint" or not isinstance(data["terminal"], bool):
         raise FileFormatError("constraint", expected="a Constraint or StateBounds", actual=repr(kind))
     inputs = (sizes.nx, sizes.parameters.size) if data["terminal"] else (sizes.nx, sizes.nu, sizes.parameters.size)
-    return Constraint(function_from_json(data["function"], name, inputs=inputs), name, soft, data["terminal"])
+    # Not by its own name: CasADi takes no blanks in it.
+    return Constraint(function_from_json(data["function"], "constraint", inputs=inputs), name, soft, data["terminal"])
 
 
 def _check_name(name: object) -> None:

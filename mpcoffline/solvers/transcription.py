@@ -62,6 +62,9 @@ class Transcription:
         self._hard = hard
         self.soft = ca.vertcat(*(h for h, _, _ in soft)) if soft else ca.SX(0, 1)
         slacks = ca.SX.sym("slack", self.soft.numel())
+        # The square alone keeps a slack from being negative, and has no kink for which a bound would be needed.
+        low = [np.full(h.numel(), 0.0 if penalty.l1 else -np.inf) for h, penalty, _ in soft]
+        self._slack_low = np.concatenate([*low, np.zeros(0)])
         self.variables = ca.vertcat(
             *(v for pair in zip(self._inputs, self._states[1:], strict=True) for v in pair), slacks
         )
@@ -119,8 +122,7 @@ class Transcription:
         low[:, mpc.nu :], high[:, mpc.nu :] = self._state_bounds
         if u0 is not None:
             low[0, : mpc.nu] = high[0, : mpc.nu] = u0
-        slacks = self.soft.numel()
-        return np.r_[low.ravel(), np.zeros(slacks)], np.r_[high.ravel(), np.full(slacks, np.inf)]
+        return np.r_[low.ravel(), self._slack_low], np.r_[high.ravel(), np.full(len(self._slack_low), np.inf)]
 
     @cached_property
     def _state_bounds(self) -> tuple[Array, Array]:

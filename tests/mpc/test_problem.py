@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mpcoffline.envs import ENV_IDS
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+from mpcoffline.mpc import MPC, Constraint, Model, NormCost, Parameter, Penalty, QuadraticCost, StateBounds
 from mpcoffline.tasks import nominal_mpc
 
 
@@ -240,3 +240,105 @@ def test_damaged_json_is_refused(path: tuple[Any, ...], value: Any) -> None:
 def test_anything_else_is_refused(data: Any) -> None:
     with pytest.raises(FileFormatError):
         MPC.from_json(data)
+
+
+# ---------------------------------------------------------------- constraints and thetas along the horizon
+
+
+def limits() -> list[Constraint | StateBounds]:
+    return [
+        Constraint(speed_limit, "speed limit"),
+        Constraint(lambda x, u, p: u[0] * x[0] - 1.0, "power", Penalty(l1=2.0, l2=1.0 / 3.0)),
+        Constraint(lambda x, p: x[0] - p["c"], "goal", terminal=True),
+        StateBounds([-np.inf, -1.0], [2.0, np.inf]),
+        StateBounds([-1.0, -1.0], [1.0, 1.0], "comfort", Penalty(l2=0.5)),
+    ]
+
+
+def test_constraints_by_place() -> None:
+    mpc = make_mpc(constraints=limits())
+    assert [c.name for c in mpc.constraints_at("stages")] == ["speed limit", "power"]
+    assert [c.name for c in mpc.constraints_at("end")] == ["goal"]
+    assert [b.name for b in mpc.state_bounds] == ["state bounds", "comfort"]
+    assert mpc.constraint_function is not None
+    np.testing.assert_allclose(mpc.constraint_function([0, 3], [0], mpc.theta).full().ravel(), [2.0, -4.0])
+    (goal,) = mpc.constraints_at("end")
+    assert float(mpc.constraint_expression(goal)(ca.SX([0.7, 0.0]), ca.SX(mpc.theta))) == pytest.approx(0.6)
+    assert make_mpc(constraints=[]).constraints is None
+    assert make_mpc(constraints=limits()[4]).constraint_function is None
+    assert len(mpc.replace(horizon=7).constraints) == 5  # fitted ones are kept
+    with pytest.raises(InvalidArgumentError, match="speed limit: expected a function of inputs of sizes"):
+        mpc.replace(model=Model(lambda x, u, p: ca.vertcat(x[1], u), 2, 1, 0.1), constraints=mpc.constraints[:1])
+
+
+@pytest.mark.parametrize(
+    ("constraints", "message"),
+    [
+        (lambda: Constraint(speed_limit, ""), "name of a constraint: expected a text"),
+        (
+            lambda: Constraint(speed_limit, soft=Penalty()),
+            "constraints.soft: expected weights >= 0, one of them positive",
+        ),
+        (lambda: Constraint(speed_limit, soft=Penalty(-1.0, 2.0)), "constraints.soft"),
+        (lambda: Constraint(speed_limit, soft=Penalty(np.inf)), "constraints.soft"),
+        (lambda: Constraint(speed_limit, "goal", terminal=True), "goal: expected a function of CasADi SX"),
+        (lambda: Constraint(lambda x, u, p: ca.SX(0, 1)), "constraints: expected a column"),
+        (lambda: StateBounds([1.0, 1.0], [0.0, 2.0]), "state bounds: expected low <= high"),
+        (lambda: StateBounds([0.0], [1.0, 2.0]), "state bounds: expected low <= high of one shape"),
+        (lambda: StateBounds([0.0, np.nan], [1.0, 2.0]), "state bounds: expected low <= high"),
+        (lambda: StateBounds([0.0], [1.0]), r"state bounds: expected 2 numbers, one a state, got shape \(1,\)"),
+        (lambda: [Constraint(speed_limit), Constraint(speed_limit)], "names of constraints: expected unique names"),
+        (lambda: [speed_limit], "expected a function .* or a list of Constraint and StateBounds"),
+        (lambda: 3.0, "constraints: expected constraints, got 3.0"),
+        (lambda: ca.Function("h", [ca.SX.sym("x", 2)], [1]), r"expected a function of inputs of sizes \[2, 1, 2\]"),
+    ],
+)
+def test_bad_constraints_are_refused(constraints: Any, message: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=message):
+        make_mpc(constraints=constraints())
+
+
+def test_json_of_all_constraints() -> None:
+    mpc = make_mpc(constraints=limits())
+    read = json_roundtrip(mpc)
+    assert_same(mpc, read)
+    assert read.to_json() == mpc.to_json()
+    for left, right in zip(mpc.constraints, read.constraints, strict=True):
+        assert (left.name, left.soft) == (right.name, right.soft)
+    np.testing.assert_array_equal(read.state_bounds[0].low, [-np.inf, -1.0])
+    np.testing.assert_array_equal(read.state_bounds[0].high, [2.0, np.inf])
+
+
+@pytest.mark.parametrize("place", range(5))
+@pytest.mark.parametrize("value", ["scrap", 0, {}, [[[]]], -1.5])
+def test_damaged_constraints_are_refused(place: int, value: Any) -> None:
+    entry = make_mpc(constraints=limits()).to_json()["constraints"][place]
+    for key in entry:
+        if (key, value) in (("name", "scrap"), ("terminal", 0)):
+            continue
+        data = json.loads(json.dumps(make_mpc(constraints=limits()).to_json()))
+        data["constraints"][place][key] = value
+        with pytest.raises(FileFormatError):
+            MPC.from_json(data)
+        del data["constraints"][place][key]
+        with pytest.raises(FileFormatError):
+            MPC.from_json(data)
+
+
+def test_theta_along_the_horizon() -> None:
+    mpc = make_mpc()
+    path = np.arange(10.0).reshape(5, 2)
+    theta = mpc.theta_along({"stage_cost.x_ref": path, "model.m": np.arange(1.0, 7.0), "stage_cost.R": [[3.0]]})
+    assert theta.shape == (1, 6, mpc.space.size)
+    for k in range(6):
+        values = mpc.space.unpack(theta[0, k])
+        np.testing.assert_array_equal(values["stage_cost.x_ref"], path[min(k, 4)])
+        assert values["model.m"] == 1.0 + k
+        np.testing.assert_allclose(values["stage_cost.R"], [[3.0]], rtol=1e-15)
+        np.testing.assert_array_equal(values["terminal_cost.x_ref"], [0.3, 0.0])
+    with pytest.raises(InvalidArgumentError, match=r"stage_cost.x_ref: expected shape \(2,\), \(5, 2\) or \(6, 2\)"):
+        mpc.theta_along({"stage_cost.x_ref": np.zeros((4, 2))})
+    with pytest.raises(UnknownIdError, match=r"stage_cost\.x_ref"):
+        mpc.theta_along({"stage_cost.xref": np.zeros((5, 2))})
+    with pytest.raises(InvalidArgumentError, match=r"model\.m"):
+        mpc.theta_along({"model.m": np.zeros(5)})
