@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import errno
+import os
 from collections.abc import Iterable
 
 
@@ -52,3 +54,20 @@ class UnknownIdError(MPCOfflineError, LookupError):
 
 class FileFormatError(MPCOfflineError, ValueError):
     """A file is damaged, is of another kind or another version, or holds what it must not hold."""
+
+
+class StorageError(MPCOfflineError, OSError):
+    """The disk or the file system refuses: it is full, read-only, or fails."""
+
+    @classmethod
+    def of(cls, path: object, error: OSError | RuntimeError) -> StorageError:
+        """Wraps what the system said about a file.
+
+        Args:
+            path: The file or folder.
+            error: The system's error.
+        """
+        full = getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error)
+        hint = "Free some space, then run it again: what was written before is intact." if full else ""
+        actual = os.strerror(errno.ENOSPC) if full else str(error)
+        return cls(f"file {path}", expected="to be written", actual=actual, hint=hint)

@@ -9,17 +9,28 @@ if TYPE_CHECKING:
     from .collection import collect
     from .minari_store import list_datasets, load_dataset
     from .recorder import MinariRecorder
+    from .repairing import RepairReport, repair
     from .transitions import TransitionTable
 
-__all__ = ["MinariRecorder", "TransitionTable", "collect", "list_datasets", "load_dataset"]
+__all__ = [
+    "MinariRecorder",
+    "RepairReport",
+    "TransitionTable",
+    "collect",
+    "list_datasets",
+    "load_dataset",
+    "repair",
+]
 
 # Loaded when first used: the recorder needs Stable-Baselines3 and with it torch, seconds of importing.
 _HOMES = {
     "MinariRecorder": "recorder",
+    "RepairReport": "repairing",
     "TransitionTable": "transitions",
     "collect": "collection",
     "list_datasets": "minari_store",
     "load_dataset": "minari_store",
+    "repair": "repairing",
 }
 
 

@@ -258,9 +258,9 @@ class _ProgressBar(BaseCallback):
 
     def _on_step(self) -> bool:
         if any(self.locals["dones"]):
-            episodes = self._recorder.episodes
-            self._returns.extend(float(np.sum(episode.rewards)) for episode in episodes[self._counted :])
-            self._counted = len(episodes)
+            returns = self._recorder.returns
+            self._returns.extend(returns[self._counted :])
+            self._counted = len(returns)
         mean = f"{np.mean(self._returns):.1f}" if self._returns else "-"
         self._bar.update(self._task, completed=min(self.num_timesteps, self._steps), mean=mean)
         return True

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import hashlib
 import importlib.metadata
 import importlib.resources
+import itertools
+import json
 import os
 import shutil
 import tempfile
@@ -14,17 +17,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError, UnknownIdError
 
+from .atomic import publish, sync_tree
+from .manifest import write_manifest
 from .recipes import TASKS, Recipe, catalog_file
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
 
+RECORDING = "mpcoffline_recording"
 GRAMMAR = "(namespace/)*name-vN of letters, digits, '-' and '_' (no dots; a namespace has two characters or more)"
 
 
@@ -45,18 +52,21 @@ class DatasetRow:
     steps: int
 
 
-def load_dataset(dataset_id: str) -> MinariDataset:
-    """Gives a data set out of the local Minari store, or one that ships with this package.
+def load_dataset(dataset_id: str, *, download: bool = True) -> MinariDataset:
+    """Gives a data set: out of the local Minari store, shipped with this package, or from the remote.
 
     A shipped data set is put into the store when it is first asked for (about two seconds); after that
-    ``minari.load_dataset`` finds it without this package.
+    ``minari.load_dataset`` finds it without this package. A download that was finished but not yet put into the
+    store needs no connection; a remote is asked only where one is configured (``MINARI_REMOTE``, or the catalogue).
 
     Args:
         dataset_id: Minari id, e.g. ``"mpcoffline/pendulum/ddpg-v0"``.
+        download: Whether a remote may be asked.
 
     Raises:
-        UnknownIdError: For an id that is neither; it names the nearest ones.
+        UnknownIdError: For an id that is nowhere; it names the nearest ones.
         FileFormatError: For a damaged data set, or a shipped file that does not have its sha256.
+        RemoteError: Where the remote does not answer.
     """
     import minari
 
@@ -65,6 +75,11 @@ def load_dataset(dataset_id: str) -> MinariDataset:
             return _load_local(dataset_id)
         if dataset_id in shipped_datasets():
             return _materialise(dataset_id, shipped_datasets()[dataset_id])
+        if download:
+            from .hub import download_dataset, find_source
+
+            if find_source(dataset_id) is not None:
+                return download_dataset(dataset_id)
     known = sorted({*minari.list_local_datasets(), *shipped_datasets()})
     nearest = difflib.get_close_matches(str(dataset_id), known, n=3, cutoff=0.4)
     hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}? " if nearest else ""
@@ -141,6 +156,16 @@ def check_new_dataset(dataset_id: str, *, overwrite: bool) -> None:
         )
 
 
+def recording_of(dataset_id: str) -> str | None:
+    """The name of the recording that a local data set was sealed from; None where it has none or does not exist."""
+    try:
+        metadata = json.loads((dataset_path(dataset_id) / "data" / "metadata.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    name = metadata.get(RECORDING) if isinstance(metadata, dict) else None
+    return name if isinstance(name, str) else None
+
+
 def write_dataset(
     dataset_id: str,
     episodes: Iterable[EpisodeBuffer],
@@ -151,61 +176,90 @@ def write_dataset(
     algorithm_name: str | None = None,
     description: str | None = None,
     overwrite: bool = False,
+    extend: bool = False,
+    recording: str | None = None,
+    building: Path | None = None,
 ) -> MinariDataset:
     """Stores episodes as a Minari data set, which appears complete or not at all.
 
     ``minari.create_dataset_from_buffers`` writes in place, so that a full disk or a killed process leaves
     half a data set under the final name. This does the same with the same storage class, but in a hidden
-    folder that is renamed when complete.
+    folder that is written to the disk, its metadata last, and renamed when complete.
 
     Args:
         dataset_id: Minari id.
-        episodes: The episodes.
+        episodes: The episodes, taken one at a time.
         env_spec: Spec of the environment; None where it has none (it cannot be recovered then).
         observation_space: Space of the observations.
         action_space: Space of the actions.
         algorithm_name: Metadata: what produced the data.
         description: Metadata: what the data are.
         overwrite: Whether an existing data set is replaced.
+        extend: Whether the new data set begins with the episodes of the one replaced, and keeps its metadata.
+        recording: Name of the recording that the episodes come from, kept in the metadata.
+        building: The folder to build in, which must not exist; by default a hidden one in the store.
 
     Returns:
         The stored data set.
 
     Raises:
         InvalidArgumentError: For a malformed id, one that exists, or no episode at all.
+        StorageError: Where the disk is full or fails; nothing is left behind.
     """
     import minari
     from minari.dataset.minari_storage import MinariStorage
 
     check_new_dataset(dataset_id, overwrite=overwrite)
-    buffers = list(episodes)
-    if not buffers:
+    iterator = iter(episodes)
+    first = next(iterator, None)
+    if first is None:
         raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
     target = dataset_path(dataset_id)
-    root = dataset_path("")
-    # Hidden from Minari's listing; in the store, so that the rename stays in one file system.
-    building = Path(tempfile.mkdtemp(prefix=".building-", dir=root))
+    metadata = {RECORDING: recording}
     try:
-        storage = MinariStorage.new(
-            building / "data",
-            observation_space=observation_space,
-            action_space=action_space,
-            env_spec=env_spec,
-        )
-        metadata = {
-            "dataset_id": dataset_id,
-            "minari_version": importlib.metadata.version("minari"),
-            "algorithm_name": algorithm_name,
-            "description": description,
-        }
-        storage.update_metadata({key: value for key, value in metadata.items() if value is not None})
-        storage.update_episodes(buffers)
-        building.chmod(0o755)
+        if building is None:
+            # Hidden from Minari's listing; in the store, so that the rename stays in one file system.
+            building = Path(tempfile.mkdtemp(prefix=".building-", dir=dataset_path("")))
+        building.mkdir(exist_ok=True)
+        data = building / "data"
+        if extend:
+            shutil.copytree(target / "data", data)
+            storage = MinariStorage.read(data)
+        else:
+            storage = MinariStorage.new(
+                data, observation_space=observation_space, action_space=action_space, env_spec=env_spec
+            )
+            metadata |= {
+                "dataset_id": dataset_id,
+                "minari_version": importlib.metadata.version("minari"),
+                "algorithm_name": algorithm_name,
+                "description": description,
+            }
+        storage.update_episodes(itertools.chain([first], iterator))
+        _finish(building, {key: value for key, value in metadata.items() if value is not None})
         _declare_namespace(dataset_id)
-        _swap_in(building, target, overwrite=overwrite)
+        publish(building, target, overwrite=overwrite)
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, MPCOfflineError) or (isinstance(error, OSError) and error.errno == errno.ENOTEMPTY):
+            raise
+        # h5py reports a full disk as either, and once more when it closes the file.
+        raise StorageError.of(target, error) from error
     finally:
-        shutil.rmtree(building, ignore_errors=True)
+        if building is not None:
+            shutil.rmtree(building, ignore_errors=True)
     return minari.load_dataset(dataset_id)
+
+
+def _finish(building: Path, metadata: dict[str, str]) -> None:
+    """Completes a data set's folder: data on the disk, then its metadata, then the manifest of both."""
+    sync_tree(building)
+    path = building / "data" / "metadata.json"
+    complete = json.loads(path.read_text(encoding="utf-8")) | metadata
+    new = path.with_suffix(".new")
+    new.write_text(json.dumps(complete), encoding="utf-8")
+    os.replace(new, path)
+    write_manifest(building)
+    building.chmod(0o755)
 
 
 def _load_local(dataset_id: str) -> MinariDataset:
@@ -213,13 +267,23 @@ def _load_local(dataset_id: str) -> MinariDataset:
 
     try:
         return minari.load_dataset(dataset_id)
-    except (ValueError, KeyError, OSError) as error:
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        AssertionError,
+        OSError,
+        ImportError,
+        gym.error.Error,
+    ) as error:
         # An interrupted writer of another tool leaves such folders: an empty metadata.json, no HDF5 file.
         raise FileFormatError(
             f"data set {dataset_id!r} in {dataset_path(dataset_id)}",
             expected="a complete Minari data set",
             actual=f"{type(error).__name__}: {error}",
-            hint="Remove that folder; a shipped data set comes back when it is loaded again.",
+            hint=f"Try `mpcoffline datasets repair {dataset_id}`, or remove that folder; a shipped data set comes"
+            " back when it is loaded again.",
         ) from error
 
 
@@ -245,17 +309,6 @@ def _materialise(dataset_id: str, file: str) -> MinariDataset:
             if not is_local(dataset_id):
                 raise
             return _load_local(dataset_id)
-
-
-def _swap_in(building: Path, target: Path, *, overwrite: bool) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if overwrite and target.exists():
-        old = Path(tempfile.mkdtemp(prefix=".replaced-", dir=building.parent))
-        os.rename(target, old / "dataset")
-        os.rename(building, target)
-        shutil.rmtree(old)
-    else:
-        os.rename(building, target)
 
 
 def _declare_namespace(dataset_id: str) -> None:

@@ -12,15 +12,16 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from mpcoffline.errors import InvalidArgumentError
 
 from .episodes import EpisodeBuilder
-from .minari_store import check_new_dataset, write_dataset
+from .minari_store import check_new_dataset
+from .recording import Recording
 
 if TYPE_CHECKING:
     from minari import MinariDataset
-    from minari.data_collector import EpisodeBuffer
 
 
 class MinariRecorder(BaseCallback):
@@ -41,19 +42,30 @@ class MinariRecorder(BaseCallback):
     step marked as truncated. The data set stores the spec of the environment without training wrappers, so
     that ``dataset.recover_environment()`` rebuilds it.
 
+    Every finished episode goes to a log at once, so that a training that is killed loses none of them. The end
+    of training makes the data set of the logs. After an interruption, recording under the same id again
+    goes on with the same logs, and ``mpcoffline.datasets.repair(dataset_id)`` makes the data set of what there is.
+
     Args:
         dataset_id: Minari id of the new data set, ``(namespace/)*name-vN``.
         overwrite: Whether an existing data set of this id may be replaced (at the end of training).
         algorithm_name: Stored as metadata; the name of the algorithm's class by default.
         description: Stored as metadata.
+        resume: False deletes what an interrupted recording of this id has left instead of continuing it.
+        sync_episodes: Finished episodes of an environment after which the log is forced to the disk; between
+            that, a lost power supply (not a killed process) can take them.
+        sync_seconds: The longest a finished episode waits for that.
         verbose: SB3's verbosity.
 
     Attributes:
         dataset: The stored data set; None before the end of training.
+        returns: The undiscounted return of each episode finished so far, in the order in which they ended.
 
     Raises:
         InvalidArgumentError: At construction for an id against Minari's grammar, or one that exists; at the
-            start of training for an on-policy algorithm or for observations that are not a Box.
+            start of training for an on-policy algorithm, observations that are not a Box, another recorder at
+            work on this id, or an interrupted recording with other spaces.
+        StorageError: During training where the disk is full or fails; the episodes before are safe.
 
     Example:
         ``agent.learn(50_000, callback=MinariRecorder("mpcoffline/pendulum/mine-v0"))``
@@ -66,30 +78,56 @@ class MinariRecorder(BaseCallback):
         overwrite: bool = False,
         algorithm_name: str | None = None,
         description: str | None = None,
+        resume: bool = True,
+        sync_episodes: int = 10,
+        sync_seconds: float = 5.0,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
         check_new_dataset(dataset_id, overwrite=overwrite)
+        if not sync_episodes >= 1:
+            raise InvalidArgumentError("sync_episodes", expected="an integer >= 1", actual=str(sync_episodes))
         self.dataset_id = dataset_id
         self.overwrite = overwrite
         self.algorithm_name = algorithm_name
         self.description = description
+        self.resume = resume
+        self.sync_episodes, self.sync_seconds = sync_episodes, sync_seconds
         self.dataset: MinariDataset | None = None
-        self._finished: list[EpisodeBuffer] = []
+        self.returns: list[float] = []
         self._running: list[EpisodeBuilder] = []
-        self._env_spec: EnvSpec | None = None
+        self._recording: Recording | None = None
 
-    @property
-    def episodes(self) -> list[EpisodeBuffer]:
-        """The episodes finished so far, in the order in which they ended."""
-        return list(self._finished)
+    def close(self) -> None:
+        """Lets go of the logs of a training that was interrupted, so that another recorder can continue them."""
+        if self._recording is not None:
+            self._recording.close()
+            self._recording = None
 
     def _on_training_start(self) -> None:
         agent = self._agent()
-        # A second `learn` with this recorder extends the data set that it wrote itself.
-        check_new_dataset(self.dataset_id, overwrite=self.overwrite or self.dataset is not None)
-        self._env_spec = _plain_spec(self.training_env.get_attr("spec")[0])
-        self._warn_of_changed_spaces()
+        self.close()
+        env_spec = _plain_spec(self.training_env.get_attr("spec")[0])
+        _warn_of_changed_spaces(self.training_env, env_spec)
+        self._recording = Recording(
+            self.dataset_id,
+            env_spec=env_spec,
+            observation_space=self.training_env.observation_space,
+            action_space=self.training_env.action_space,
+            # A second `learn` with this recorder extends the data set that it wrote itself.
+            mode="extend" if self.dataset is not None else "replace" if self.overwrite else "new",
+            algorithm_name=self.algorithm_name or type(self.model).__name__,
+            description=self.description,
+            resume=self.resume,
+            sync_episodes=self.sync_episodes,
+            sync_seconds=self.sync_seconds,
+        )
+        if self._recording.resumed:
+            warnings.warn(
+                f"MinariRecorder: {self._recording.resumed} episodes of an interrupted recording of"
+                f" {self.dataset_id!r} are continued; resume=False starts anew.",
+                stacklevel=2,
+            )
         observations = self._before(agent)
         if agent.num_timesteps == 0:
             infos = list(self.training_env.unwrapped.reset_infos)
@@ -100,6 +138,7 @@ class MinariRecorder(BaseCallback):
 
     def _on_step(self) -> bool:
         agent, infos, dones = self._agent(), self.locals["infos"], self.locals["dones"]
+        recording = self._started()
         normalizer = agent.get_vec_normalize_env()
         reached: Any = self.locals["new_obs"] if normalizer is None else normalizer.get_original_obs()
         for i, (info, done) in enumerate(zip(infos, dones, strict=True)):
@@ -120,39 +159,28 @@ class MinariRecorder(BaseCallback):
                 info=info,
             )
             if done:
-                self._finished.append(self._running[i].finish())
+                episode = self._running[i].finish()
+                self.returns.append(float(np.sum(episode.rewards)))
+                recording.append(i, episode, complete=True)
                 # Now, not at the next step: an episode of one step would overwrite the reset info.
                 self._running[i] = EpisodeBuilder(reached[i], self.training_env.unwrapped.reset_infos[i])
+        recording.poll()
         return True
 
     def _on_training_end(self) -> None:
-        unfinished = [builder.finish(truncate=True) for builder in self._running if len(builder) > 0]
-        self._finished += unfinished
-        self.dataset = write_dataset(
-            self.dataset_id,
-            self._finished,
-            env_spec=self._env_spec,
-            observation_space=self.training_env.observation_space,
-            action_space=self.training_env.action_space,
-            algorithm_name=self.algorithm_name or type(self.model).__name__,
-            description=self.description,
-            overwrite=self.overwrite or self.dataset is not None,
-        )
+        recording = self._started()
+        for i, builder in enumerate(self._running):
+            if len(builder) > 0:
+                episode = builder.finish(truncate=True)
+                self.returns.append(float(np.sum(episode.rewards)))
+                recording.append(i, episode, complete=False)
+        self.dataset = recording.seal()
+        self._recording = None
 
-    def _warn_of_changed_spaces(self) -> None:
-        """Warns where a training wrapper changes what is recorded, so that the spec does not rebuild it."""
-        if self._env_spec is None:
-            return
-        plain = gym.make(self._env_spec)
-        for kind in ("observation_space", "action_space"):
-            recorded, original = getattr(self.training_env, kind), getattr(plain, kind)
-            if recorded != original:
-                warnings.warn(
-                    f"MinariRecorder: a wrapper changes the {kind} to {recorded}, and that is what gets recorded;"
-                    f" dataset.recover_environment() gives {original}. Scale inside the agent instead.",
-                    stacklevel=2,
-                )
-        plain.close()
+    def _started(self) -> Recording:
+        if self._recording is None:
+            raise InvalidArgumentError("MinariRecorder", expected="a training that has started", actual="none")
+        return self._recording
 
     def _agent(self) -> OffPolicyAlgorithm:
         if not isinstance(self.model, OffPolicyAlgorithm):
@@ -184,3 +212,19 @@ def _plain_spec(spec: EnvSpec | None) -> EnvSpec | None:
     plain.additional_wrappers = ()
     plain.kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
     return plain
+
+
+def _warn_of_changed_spaces(env: VecEnv, spec: EnvSpec | None) -> None:
+    """Warns where a training wrapper changes what is recorded, so that the spec does not rebuild it."""
+    if spec is None:
+        return
+    plain = gym.make(spec)
+    for kind in ("observation_space", "action_space"):
+        recorded, original = getattr(env, kind), getattr(plain, kind)
+        if recorded != original:
+            warnings.warn(
+                f"MinariRecorder: a wrapper changes the {kind} to {recorded}, and that is what gets recorded;"
+                f" dataset.recover_environment() gives {original}. Scale inside the agent instead.",
+                stacklevel=3,
+            )
+    plain.close()

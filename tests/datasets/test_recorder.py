@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env as sb3_make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 import mpcoffline.envs  # noqa: F401
-from mpcoffline.datasets import MinariRecorder, TransitionTable
+from mpcoffline.datasets import MinariRecorder, TransitionTable, repair
 from mpcoffline.errors import InvalidArgumentError
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
@@ -234,3 +235,50 @@ def test_recording_does_not_change_the_training() -> None:
         weights.append(agent.policy.state_dict())
     for name, value in weights[0].items():
         np.testing.assert_array_equal(value.numpy(), weights[1][name].numpy())
+
+
+class BrokenOffError(Exception):
+    pass
+
+
+class StopAfter(BaseCallback):
+    """Breaks a training off in the middle of its second episode."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= 150:
+            raise BrokenOffError
+        return True
+
+
+def test_a_training_that_fails_is_continued_by_the_next() -> None:
+    agent = agent_on(make_vec_env(PENDULUM, 1, seed=0))
+    first = MinariRecorder("mpcoffline/test/again-v0")
+    with pytest.raises(BrokenOffError):
+        agent.learn(300, callback=[first, StopAfter()])
+    assert first.dataset is None
+    assert len(first.returns) == 1
+    with pytest.raises(InvalidArgumentError, match=r"one recorder at a time.*recorder.close\(\)"):
+        agent.learn(10, callback=MinariRecorder("mpcoffline/test/again-v0"))
+    first.close()
+    second = MinariRecorder("mpcoffline/test/again-v0")
+    with pytest.warns(UserWarning, match="1 episodes of an interrupted recording"):
+        agent.learn(110, callback=second)
+    episodes = list(minari.load_dataset("mpcoffline/test/again-v0").iterate_episodes())
+    assert [len(episode.actions) for episode in episodes] == [100, 100, 10]
+    assert first.returns + second.returns == [episode.rewards.sum() for episode in episodes]
+
+
+def test_what_a_failed_training_recorded_can_be_sealed() -> None:
+    agent = agent_on(make_vec_env(PENDULUM, 1, seed=0))
+    recorder = MinariRecorder("mpcoffline/test/sealed-v0")
+    with pytest.raises(BrokenOffError):
+        agent.learn(300, callback=[recorder, StopAfter()])
+    recorder.close()
+    report = repair("mpcoffline/test/sealed-v0")
+    assert (report.action, report.episodes, report.steps) == ("sealed", 1, 100)
+    assert minari.load_dataset("mpcoffline/test/sealed-v0").recover_environment().spec.id == PENDULUM
+
+
+def test_the_number_of_episodes_between_synchronisations_is_checked() -> None:
+    with pytest.raises(InvalidArgumentError, match="sync_episodes: expected an integer >= 1, got 0"):
+        MinariRecorder("mpcoffline/test/sync-v0", sync_episodes=0)
