@@ -78,6 +78,7 @@ def source(mpc: MPC) -> str:
         _text("vector.h"),
         emit("gen_prepare", [theta], prepared),
         *(emit(name, [*inputs[name], parameters], body) for name, body in zip(outputs, bodies, strict=True)),
+        _text("core.c"),
         _text("kernel.c"),
     ]
     return "\n\n".join(parts)

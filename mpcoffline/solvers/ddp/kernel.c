@@ -1,54 +1,6 @@
-/* Box-constrained differential dynamic programming (Gauss-Newton), LANES problems in lock step.
- *
- * Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014, with the discount inside the
- * recursion (V_k = L + gamma V_{k+1}), so that late stages stay well scaled, and with defects in the first backward pass
- * (Giftthaler et al., arXiv:1711.11006), so that a warm start need not obey the model.
- *
- * Included after generated code that defines NX, NU, NP, NQ and the functions
- *   gen_prepare(theta, out):   what depends on theta alone [NQ]; the others take p = (theta, that)
- *   gen_step(x, u, p, out):    x+ [NX], L [1]
- *   gen_q(x, u, x_next, Vx, Vxx, gamma, p, out):  f(x, u) - x_next [NX], Qx [NX], Qu [NU], Qxx [NT], Qux [NU*NX],
- *                              Quu [NU*NU]
- *   gen_final(x, p, out):      T [1]
- *   gen_final_expand(x, p, out): Tx [NX], Txx [NT]
- * with matrices column-major, and Vxx, Qxx, Txx as upper triangles column by column (NT = NX (NX + 1) / 2).
- *
- * No lane looks at another: a problem's result is the same to the bit whatever is solved next to it.
- */
-#include <stdint.h>
+/* Batches of problems: LANES of them in lock step through the iterations of core.c. */
 #include <stdlib.h>
 #include <string.h>
-
-enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING = -1 };
-
-#define MAX_BACKTRACKS 10
-#define MU_FIRST 1e-3 /* regularisation relative to Quu */
-#define MU_MIN 1e-5
-#define MU_MAX 1e6
-#define ARMIJO 1e-4
-#define INPUT_TOLERANCE 3e-5
-#define RIDGE 1e-12   /* keeps a singular Quu (an input that nothing depends on) invertible */
-#define NT (NX * (NX + 1) / 2)
-#define TRI(i, j) ((j) * ((j) + 1) / 2 + (i)) /* of an upper triangle, i <= j */
-
-typedef struct {
-    int64_t horizon;
-    double discount;
-    const double *low, *high; /* (NU) */
-    int64_t max_iterations;
-    double tolerance;         /* on the predicted decrease, relative to 1 + |J| */
-} mpc_problem;
-
-typedef struct {
-    vd *x, *u, *x_new, *u_new; /* (N+1, NX), (N, NU) */
-    vd *k, *K;                 /* feedforward (N, NU), feedback (N, NU, NX) column-major */
-    vd p[NP + NQ + 1], s[NX], low0[NU], high0[NU];
-    vd J, J_new, mu, predicted, defect;
-    vl pd; /* lanes whose backward pass found a positive definite Quu */
-} lanes;
-
-static inline vl all_lanes(void) { return vd_le(V(0.0), V(0.0)); }
-static inline vl no_lanes(void) { return (vl){0}; }
 
 static void lanes_free(lanes *w) {
     if (!w) return;
@@ -71,194 +23,6 @@ static lanes *lanes_new(int64_t N) {
         *fields[i] = memset(memory, 0, sizes[i] * sizeof(vd));
     }
     return w;
-}
-
-static inline vd clip(vd a, vd low, vd high) { return vd_min(vd_max(a, low), high); }
-
-/* x+ and J along (x, u) -> open-loop states from s; returns the cost. */
-static vd rollout_open(const mpc_problem *m, const lanes *w, vd *x, const vd *u) {
-    vd J = V(0.0), out[NX + 1];
-    double weight = 1.0;
-    for (int i = 0; i < NX; ++i) x[i] = w->s[i];
-    for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
-        gen_step(x + k * NX, u + k * NU, w->p, out);
-        for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
-        J += weight * out[NX];
-    }
-    gen_final(x + m->horizon * NX, w->p, out);
-    return J + weight * out[0];
-}
-
-/* The closed-loop rollout of a step of length alpha (per lane) into x_new, u_new; sets J_new. */
-static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
-    vd J = V(0.0), out[NX + 1], *x = w->x_new;
-    double weight = 1.0;
-    for (int i = 0; i < NX; ++i) x[i] = w->s[i];
-    for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
-        const vd *K = w->K + k * NU * NX;
-        vd dx[NX], *u = w->u_new + k * NU;
-        for (int i = 0; i < NX; ++i) dx[i] = x[k * NX + i] - w->x[k * NX + i];
-        for (int a = 0; a < NU; ++a) {
-            vd v = w->u[k * NU + a] + alpha * w->k[k * NU + a];
-            for (int i = 0; i < NX; ++i) v += K[i * NU + a] * dx[i];
-            u[a] = clip(v, k ? V(m->low[a]) : w->low0[a], k ? V(m->high[a]) : w->high0[a]);
-        }
-        gen_step(x + k * NX, u, w->p, out);
-        for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
-        J += weight * out[NX];
-    }
-    gen_final(x + m->horizon * NX, w->p, out);
-    w->J_new = J + weight * out[0];
-}
-
-/* H = L D L' of a matrix, in place: 1/D on the diagonal, L below it. Clears lanes that are not positive definite. */
-static void factorise(vd H[NU][NU], vl *pd) {
-    for (int j = 0; j < NU; ++j) {
-        vd scaled[NU], d = H[j][j]; /* row j of L, times D */
-        for (int l = 0; l < j; ++l) {
-            scaled[l] = H[j][l];
-            H[j][l] *= H[l][l];
-            d -= H[j][l] * scaled[l];
-        }
-        vl ok = vd_lt(V(0.0), d);
-        *pd &= ok;
-        H[j][j] = 1.0 / vd_select(ok, d, V(1.0));
-        for (int i = j + 1; i < NU; ++i) /* column j of L, times D, as the rows below expect it */
-            for (int l = 0; l < j; ++l) H[i][j] -= H[j][l] * H[i][l];
-    }
-}
-
-/* b <- H^-1 b with the factors of H. */
-static void substitute(vd H[NU][NU], vd b[NU]) {
-    for (int i = 0; i < NU; ++i)
-        for (int l = 0; l < i; ++l) b[i] -= H[i][l] * b[l];
-    for (int i = NU - 1; i >= 0; --i) {
-        b[i] *= H[i][i];
-        for (int l = i + 1; l < NU; ++l) b[i] -= H[l][i] * b[l];
-    }
-}
-
-/* min q(d) = 1/2 d'Hd + g'd, low <= d <= high (low <= 0 <= high) by projected Newton steps from d = 0. Returns which
- * inputs are free of their bounds and the factors of that part of H (identity elsewhere). */
-static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high[NU], vd d[NU], vl is_free[NU],
-                   vd F[NU][NU], vl *pd) {
-    vl finished = no_lanes(), definite = all_lanes();
-    for (int i = 0; i < NU; ++i) d[i] = V(0.0);
-    for (int pass = 0; pass < 4 * NU + 4; ++pass) {
-        vd slope[NU], b[NU], trial[NU];
-        vl any_bound = no_lanes(), clipped = no_lanes();
-        for (int i = 0; i < NU; ++i) {
-            slope[i] = g[i];
-            for (int j = 0; j < NU; ++j) slope[i] += H[i][j] * d[j];
-            vl held = (vd_le(d[i], low[i]) & vd_lt(V(0.0), slope[i])) | (vd_le(high[i], d[i]) & vd_lt(slope[i], V(0.0)));
-            is_free[i] = pass ? (is_free[i] & finished) | (~held & ~finished) : ~held;
-            any_bound |= ~is_free[i];
-            b[i] = vd_select(is_free[i], -slope[i], V(0.0));
-        }
-        for (int i = 0; i < NU; ++i)
-            for (int j = 0; j < NU; ++j) F[i][j] = vd_select(is_free[i] & is_free[j], H[i][j], V(i == j ? 1.0 : 0.0));
-        definite = all_lanes();
-        factorise(F, &definite);
-        substitute(F, b);
-        for (int i = 0; i < NU; ++i) {
-            trial[i] = clip(d[i] + b[i], low[i], high[i]);
-            clipped |= trial[i] != d[i] + b[i];
-            if (NU == 1) is_free[i] &= ~clipped;
-        }
-        if (NU == 1) { /* clipping the minimiser of a parabola gives the constrained one */
-            d[0] = trial[0];
-            break;
-        }
-        /* Halve the step, along its projection, until q falls enough. */
-        vd t = V(1.0), expected = V(0.0), change = V(0.0);
-        for (int halving = 0; halving < 12; ++halving) {
-            vd fall = V(0.0);
-            expected = V(0.0);
-            for (int i = 0; i < NU; ++i) {
-                vd step_i = trial[i] - d[i], curvature = V(0.0);
-                for (int j = 0; j < NU; ++j) curvature += H[i][j] * (trial[j] - d[j]);
-                expected -= slope[i] * step_i;
-                fall -= step_i * (slope[i] + 0.5 * curvature);
-            }
-            vl shorten = vd_lt(fall, 0.1 * expected) & ~finished & definite;
-            if (!vl_any(shorten)) break;
-            t = vd_select(shorten, 0.5 * t, t);
-            for (int i = 0; i < NU; ++i) trial[i] = vd_select(shorten, clip(d[i] + t * b[i], low[i], high[i]), trial[i]);
-        }
-        /* Done: the minimum without bounds, or a step that is small against the whole. */
-        for (int i = 0; i < NU; ++i) {
-            d[i] = vd_select(finished, d[i], trial[i]);
-            change -= g[i] * d[i];
-        }
-        finished |= ~(any_bound | clipped) | vd_le(expected, 1e-12 * change) | ~definite;
-        if (!vl_any(~finished)) break;
-    }
-    *pd &= definite;
-}
-
-/* Riccati recursion along (x, u): gains k, K, the predicted decrease of J, and where Quu was positive definite. */
-static void backward(const mpc_problem *m, lanes *w) {
-    vd Vx[NX], Vxx[NT], out[NX + NX + NU + NT + NU * NX + NU * NU];
-    int64_t N = m->horizon;
-    gen_final_expand(w->x + N * NX, w->p, out);
-    for (int i = 0; i < NX; ++i) Vx[i] = out[i];
-    for (int i = 0; i < NT; ++i) Vxx[i] = out[NX + i];
-    double weight = 1.0;
-    for (int64_t k = 1; k < N; ++k) weight *= m->discount;
-    vd discount = V(m->discount);
-    w->pd = all_lanes();
-    w->predicted = w->defect = V(0.0);
-    for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
-        const vd *u = w->u + k * NU;
-        gen_q(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
-        const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NT, *Quu = Qux + NU * NX;
-        for (int i = 0; i < NX; ++i) w->defect = vd_max(w->defect, vd_abs(out[i]));
-        /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. */
-        vd H[NU][NU], low[NU], high[NU], d[NU], F[NU][NU];
-        for (int a = 0; a < NU; ++a) {
-            vd size = V(0.0);
-            for (int b = 0; b < NU; ++b) {
-                H[a][b] = Quu[b * NU + a];
-                size += vd_abs(H[a][b]);
-            }
-            H[a][a] += (w->mu + RIDGE) * size + RIDGE;
-            low[a] = (k ? V(m->low[a]) : w->low0[a]) - u[a];
-            high[a] = (k ? V(m->high[a]) : w->high0[a]) - u[a];
-        }
-        vl is_free[NU];
-        box_qp(H, Qu, low, high, d, is_free, F, &w->pd);
-        vd *K = w->K + k * NU * NX;
-        for (int i = 0; i < NX; ++i) {
-            vd b[NU];
-            for (int a = 0; a < NU; ++a) b[a] = vd_select(is_free[a], -Qux[i * NU + a], V(0.0));
-            substitute(F, b);
-            for (int a = 0; a < NU; ++a) K[i * NU + a] = b[a];
-        }
-        /* Value of the step: V <- Q(dx, d + K dx). */
-        vd half = V(0.0), slope = V(0.0), gradient[NU], M[NU][NX];
-        for (int a = 0; a < NU; ++a) {
-            vd Quud = V(0.0);
-            for (int b = 0; b < NU; ++b) Quud += Quu[b * NU + a] * d[b];
-            w->k[k * NU + a] = d[a];
-            gradient[a] = Qu[a] + Quud;
-            slope += Qu[a] * d[a];
-            half += 0.5 * d[a] * Quud;
-            for (int i = 0; i < NX; ++i) {
-                M[a][i] = Qux[i * NU + a];
-                for (int b = 0; b < NU; ++b) M[a][i] += Quu[b * NU + a] * K[i * NU + b];
-            }
-        }
-        w->predicted -= weight * (slope + half);
-        for (int i = 0; i < NX; ++i) {
-            Vx[i] = Qx[i];
-            for (int a = 0; a < NU; ++a) Vx[i] += K[i * NU + a] * gradient[a] + Qux[i * NU + a] * d[a];
-            for (int j = i; j < NX; ++j) {
-                vd v = Qxx[TRI(i, j)];
-                for (int a = 0; a < NU; ++a) v += K[i * NU + a] * M[a][j] + Qux[i * NU + a] * K[j * NU + a];
-                Vxx[TRI(i, j)] = v;
-            }
-        }
-    }
 }
 
 /* One problem per lane; lane i works on problem queue[i] or on nothing (-1). */
@@ -307,20 +71,6 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
     b->iterations[i] = iterations;
 }
 
-/* Takes over the new trajectory where the mask says so. */
-static void accept(const mpc_problem *m, lanes *w, vl mask) {
-    w->J = vd_select(mask, w->J_new, w->J);
-    if (!vl_any(~mask)) {
-        vd *x = w->x, *u = w->u;
-        w->x = w->x_new, w->u = w->u_new;
-        w->x_new = x, w->u_new = u;
-        return;
-    }
-    if (!vl_any(mask)) return;
-    for (int64_t k = 0; k < m->horizon * NU; ++k) w->u[k] = vd_select(mask, w->u_new[k], w->u[k]);
-    for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(mask, w->x_new[k], w->x[k]);
-}
-
 /* Solves problems first, first + stride, ... of the batch; a lane that finishes takes the next one. */
 static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t stride) {
     lanes *w = lanes_new(m->horizon);
@@ -351,48 +101,15 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
             w->J = vd_select(fresh, J, w->J);
         }
-        backward(m, w);
-        /* A point is a solution when the model holds and the quadratic model promises no further decrease. */
-        vd scale = V(1.0) + vd_abs(w->J);
-        vl finite_J = vd_lt(vd_abs(w->J), V(INFINITY));
-        /* A warm start that obeys the model is as good as a rollout, only its cost is not known before the step. */
-        vl nearly = vd_lt(w->defect, V(1e-9));
-        /* The cost can be flat where the policy is not: the first input must have settled too. */
-        vl settled = all_lanes();
-        for (int a = 0; a < NU; ++a)
-            settled &= vd_le(vd_abs(w->k[a]), INPUT_TOLERANCE * (1.0 + vd_abs(w->u[a])));
-        /* A step found with heavy regularisation promises little without being near a solution. */
-        settled &= w->pd & vd_le(w->mu, V(1.0));
-        vl small = finite_J & settled & vd_lt(w->predicted, m->tolerance * scale);
-        vl open = all_lanes(), moved = no_lanes();
-        vd alpha = V(1.0);
-        for (int trial = 0; trial < MAX_BACKTRACKS; ++trial) {
-            rollout(m, w, alpha);
-            vl better = vd_lt(w->J_new, w->J - ARMIJO * alpha * vd_max(w->predicted, V(0.0)));
-            better &= vd_lt(vd_abs(w->J_new), V(INFINITY)) & open & w->pd;
-            accept(m, w, better);
-            moved |= better;
-            open &= ~better & w->pd & ~small; /* the last step of a solution is tried once, at full length */
-            int wanted = 0;
-            for (int l = 0; l < LANES; ++l) wanted |= problem[l] >= 0 && open[l];
-            if (!wanted) break;
-            alpha = alpha * 0.4;
-        }
+        vl wanted = no_lanes(), converged, moved, stalled;
+        for (int l = 0; l < LANES; ++l) wanted[l] = -(problem[l] >= 0);
+        iterate(m, w, wanted, &converged, &moved, &stalled);
         for (int l = 0; l < LANES; ++l) {
             if (problem[l] < 0) continue;
-            int64_t status = RUNNING;
+            int64_t status = converged[l] ? CONVERGED : stalled[l] ? STALLED : RUNNING;
             ++count[l];
-            if (small[l] || (nearly[l] && moved[l] && settled[l] &&
-                             w->predicted[l] < m->tolerance * (1.0 + fabs(w->J[l]))))
-                status = CONVERGED;
-            else if (moved[l]) w->mu[l] = w->mu[l] * 0.2 > MU_MIN ? w->mu[l] * 0.2 : 0.0;
-            else {
-                w->mu[l] = w->mu[l] > 0.0 ? w->mu[l] * 8.0 : MU_FIRST;
-                if (!(w->mu[l] < MU_MAX)) status = STALLED;
-            }
             if (status == RUNNING && count[l] >= m->max_iterations) status = ITERATION_LIMIT;
             if (status != RUNNING) {
-                if (!(w->J[l] < INFINITY && w->J[l] > -INFINITY)) status = NOT_FINITE;
                 store_lane(m, b, w, l, problem[l], status, count[l]);
                 problem[l] = -1;
             }

@@ -16,6 +16,7 @@ static inline vd V(double a) { return a - (vd){0}; }
 static inline vd vd_select(vl mask, vd a, vd b) { return (vd)((mask & (vl)a) | (~mask & (vl)b)); }
 static inline vl vd_lt(vd a, vd b) { return a < b; }
 static inline vl vd_le(vd a, vd b) { return a <= b; }
+static inline vl vd_ne(vd a, vd b) { return a != b; }
 static inline vd vd_min(vd a, vd b) { return vd_select(a < b, a, b); }
 static inline vd vd_max(vd a, vd b) { return vd_select(a > b, a, b); }
 static inline vd vd_abs(vd a) { return vd_select(a < 0.0, -a, a); }
