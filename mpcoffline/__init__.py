@@ -24,7 +24,16 @@ if TYPE_CHECKING:
     )
     from mpcoffline.evaluation import evaluate
     from mpcoffline.learner import OfflineMPCLearner
-    from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
+    from mpcoffline.mpc import (
+        MPC,
+        Constraint,
+        Model,
+        NormCost,
+        Parameter,
+        Penalty,
+        QuadraticCost,
+        StateBounds,
+    )
     from mpcoffline.policy import MPCPolicy
     from mpcoffline.solvers import make_solver
     from mpcoffline.tasks import nominal_mpc
@@ -34,10 +43,13 @@ __version__ = "0.1.0"
 # Where each public name lives; the module is imported when the name is first used.
 _HOMES = {
     "MPC": "mpc",
+    "Constraint": "mpc",
     "Model": "mpc",
     "NormCost": "mpc",
     "Parameter": "mpc",
+    "Penalty": "mpc",
     "QuadraticCost": "mpc",
+    "StateBounds": "mpc",
     "make_solver": "solvers",
     "MPCPolicy": "policy",
     "OfflineMPCLearner": "learner",
@@ -57,6 +69,7 @@ _HOMES = {
 
 __all__ = [
     "MPC",
+    "Constraint",
     "FileFormatError",
     "InvalidArgumentError",
     "InvalidDataError",
@@ -67,7 +80,9 @@ __all__ = [
     "NormCost",
     "OfflineMPCLearner",
     "Parameter",
+    "Penalty",
     "QuadraticCost",
+    "StateBounds",
     "TransitionTable",
     "UnknownIdError",
     "__version__",

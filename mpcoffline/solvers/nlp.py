@@ -20,7 +20,7 @@ from .transcription import Multipliers, Transcription
 from .workers import WorkerPool
 
 _FEASIBILITY_TOLERANCE = 1e-6  # of the size of the states
-_OPTIMALITY_TOLERANCE = 1e-6  # of the size of the terms of the gradient
+_OPTIMALITY_TOLERANCE = 1e-5  # of the size of the terms of the gradient
 
 
 class IpoptSolver(Solver):

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from mpcoffline import parallel
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, QuadraticCost, StateBounds
 from mpcoffline.parallel import JobError
@@ -29,7 +30,7 @@ def problem(**changes: Any) -> MPC:
     return MPC(**(arguments | changes))
 
 
-def test_workers_give_the_same_and_end_with_the_solver() -> None:
+def test_workers_give_the_same_and_end_with_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     mpc = problem()
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-0.4, 0.4, size=(11, 2)), rng.uniform(-1, 1, size=(11, 1))
@@ -53,6 +54,16 @@ def test_workers_give_the_same_and_end_with_the_solver() -> None:
     assert set(multiprocessing.active_children()) == before
     np.testing.assert_array_equal(shared.solve(x[:3]).u, first.u[:3])
     assert len(set(multiprocessing.active_children()) - before) == 2
+
+    # So is Ctrl-C while the batch is waited for.
+    def interrupt(*_: object) -> list[Any]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(parallel, "wait", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            shared.solve(x)
+    assert set(multiprocessing.active_children()) == before
     shared.close()
     assert set(multiprocessing.active_children()) == before
 
