@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .collection import collect
+    from .logs import dataset_from_arrays, from_csv, record
     from .minari_store import list_datasets, load_dataset
     from .recorder import MinariRecorder
     from .repairing import RepairReport, repair
@@ -17,8 +18,11 @@ __all__ = [
     "RepairReport",
     "TransitionTable",
     "collect",
+    "dataset_from_arrays",
+    "from_csv",
     "list_datasets",
     "load_dataset",
+    "record",
     "repair",
 ]
 
@@ -28,8 +32,11 @@ _HOMES = {
     "RepairReport": "repairing",
     "TransitionTable": "transitions",
     "collect": "collection",
+    "dataset_from_arrays": "logs",
+    "from_csv": "logs",
     "list_datasets": "minari_store",
     "load_dataset": "minari_store",
+    "record": "logs",
     "repair": "repairing",
 }
 

@@ -1,0 +1,367 @@
+"""Data sets without a learning agent: a policy in an environment, arrays, or the log file of a real plant."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from mpcoffline.errors import InvalidArgumentError, InvalidDataError
+
+from .checks import floats
+from .episodes import EpisodeBuilder
+from .minari_store import write_dataset
+from .recording import Recording
+from .transitions import TransitionTable
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from minari.data_collector import EpisodeBuffer
+
+Cost = Callable[[NDArray[np.float64], NDArray[np.float64]], ArrayLike]
+
+
+def record(
+    env: gym.Env[Any, Any] | str,
+    policy: Any,
+    n_episodes: int,
+    dataset_id: str,
+    *,
+    seed: int | None = None,
+    deterministic: bool = True,
+    overwrite: bool = False,
+    algorithm_name: str | None = None,
+    description: str | None = None,
+) -> MinariDataset:
+    """Runs a policy and records what happens, as safely as :class:`MinariRecorder`.
+
+    A recording that was interrupted goes on with the episode after the last one finished; with a seed the result is the
+    same as without the interruption.
+
+    Args:
+        env: The environment or its id.
+        policy: Anything with SB3's ``predict``, or a function from an observation ``(ny,)`` to an action ``(nu,)``.
+        n_episodes: Number of episodes.
+        dataset_id: Minari id of the new data set.
+        seed: Episode i starts from ``env.reset(seed=seed + i)``.
+        deterministic: Passed to ``predict``.
+        overwrite: Whether an existing data set of this id may be replaced.
+        algorithm_name: Stored as metadata; the name of the policy's class by default.
+        description: Stored as metadata.
+
+    Returns:
+        The stored data set.
+
+    Raises:
+        InvalidArgumentError: For a bad id, another recorder at work on it, fewer than one episode, or an action
+            outside the action space; the episodes before are kept then.
+        StorageError: Where the disk refuses; the episodes before are kept.
+    """
+    if n_episodes < 1:
+        raise InvalidArgumentError("n_episodes", expected="an integer >= 1", actual=str(n_episodes))
+    made = gym.make(env) if isinstance(env, str) else env
+    recording = Recording(
+        dataset_id,
+        env_spec=made.spec,
+        observation_space=made.observation_space,
+        action_space=made.action_space,
+        mode="replace" if overwrite else "new",
+        algorithm_name=algorithm_name or getattr(policy, "__name__", type(policy).__name__),
+        description=description,
+    )
+    try:
+        for number in range(recording.resumed, n_episodes):
+            episode_seed = None if seed is None else seed + number
+            recording.append(0, _run(made, policy, number, episode_seed, deterministic), complete=True)
+        return recording.seal()
+    finally:
+        recording.close()
+        if isinstance(env, str):
+            made.close()
+
+
+def _run(env: gym.Env[Any, Any], policy: Any, number: int, seed: int | None, deterministic: bool) -> EpisodeBuffer:
+    observation, info = env.reset(seed=seed)
+    if seed is not None:
+        env.action_space.seed(seed)  # for policies that sample it
+    episode = EpisodeBuilder(observation, info)
+    state: Any = None
+    first, done = np.ones(1, dtype=bool), False
+    while not done:
+        if hasattr(policy, "predict"):
+            action, state = policy.predict(observation, state=state, episode_start=first, deterministic=deterministic)
+        else:
+            action = policy(observation)
+        first = np.zeros(1, dtype=bool)
+        action = np.asarray(action, dtype=env.action_space.dtype)
+        if not env.action_space.contains(action):
+            raise InvalidArgumentError(
+                f"policy, episode {number}, step {len(episode)}: action",
+                expected=f"an element of {env.action_space}",
+                actual=f"{action} of shape {action.shape}",
+            )
+        observation, reward, terminated, truncated, info = env.step(action)
+        episode.add(action, float(reward), observation, terminated=terminated, truncated=truncated, info=info)
+        done = terminated or truncated
+    return episode.finish()
+
+
+def dataset_from_arrays(
+    dataset_id: str,
+    episodes: Iterable[tuple[ArrayLike, ArrayLike, ArrayLike]],
+    *,
+    action_low: ArrayLike = -np.inf,
+    action_high: ArrayLike = np.inf,
+    terminated: Sequence[bool] | None = None,
+    description: str | None = None,
+    overwrite: bool = False,
+) -> MinariDataset:
+    """Stores trajectories as a Minari data set.
+
+    Args:
+        dataset_id: Minari id of the new data set.
+        episodes: For each episode its observations ``(T+1, ny)``, actions ``(T, nu)`` and costs ``(T,)``.
+        action_low: Lower bounds of the actions, ``(nu,)`` or a number.
+        action_high: Upper bounds of the actions.
+        terminated: For each episode, whether it ended in a terminal state; otherwise it was cut off there.
+        description: Stored as metadata.
+        overwrite: Whether an existing data set of this id may be replaced.
+
+    Raises:
+        InvalidArgumentError: For a bad id, or one that exists.
+        InvalidDataError: For a wrong shape, NaN or inf, or an action out of bounds; names episode and step.
+        StorageError: Where the disk refuses.
+    """
+    checked = [_checked(f"episode {i}", *episode) for i, episode in enumerate(episodes)]
+    if not checked:
+        raise InvalidDataError(f"data set {dataset_id!r}", expected="at least one episode", actual="none")
+    ends = [False] * len(checked) if terminated is None else list(terminated)
+    if len(ends) != len(checked):
+        raise InvalidArgumentError("terminated", expected=f"{len(checked)} values", actual=str(len(ends)))
+    ny, nu = checked[0][0].shape[1], checked[0][1].shape[1]
+    low, high = (np.broadcast_to(np.asarray(b, np.float32), (nu,)).copy() for b in (action_low, action_high))
+    for i, (s, a, _) in enumerate(checked):
+        if (s.shape[1], a.shape[1]) != (ny, nu):
+            raise InvalidDataError(
+                f"episode {i}", expected=f"{ny} observations and {nu} actions", actual=f"{s.shape[1]}, {a.shape[1]}"
+            )
+        outside = (a.astype(np.float32) < low) | (a.astype(np.float32) > high)
+        if outside.any():
+            step, column = (int(k) for k in np.argwhere(outside)[0])
+            raise InvalidDataError(
+                f"episode {i}, step {step}: action {column}",
+                expected=f"a value in [{low[column]:g}, {high[column]:g}]",
+                actual=f"{a[step, column]:g}",
+            )
+    return write_dataset(
+        dataset_id,
+        (_episode(s, a, cost, end) for (s, a, cost), end in zip(checked, ends, strict=True)),
+        env_spec=None,
+        observation_space=spaces.Box(-np.inf, np.inf, (ny,), np.float32),
+        action_space=spaces.Box(low, high, (nu,), np.float32),
+        description=description,
+        overwrite=overwrite,
+    )
+
+
+def _checked(
+    name: str, observations: ArrayLike, actions: ArrayLike, costs: ArrayLike
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    s, a, cost = (
+        floats(name, "observations", observations, 2),
+        floats(name, "actions", actions, 2),
+        floats(name, "costs", costs, 1),
+    )
+    for column, found, wanted in (("observations", len(s), len(a) + 1), ("costs", len(cost), len(a))):
+        if found != wanted or len(a) == 0:
+            raise InvalidDataError(
+                f"{name}: {column}", expected=f"{wanted} rows, with {len(a)} actions", actual=str(found)
+            )
+    for column, values in (("observation", s), ("action", a), ("cost", cost[:, None])):
+        bad = ~np.isfinite(values.astype(np.float32))
+        if bad.any():
+            step, i = (int(k) for k in np.argwhere(bad)[0])
+            raise InvalidDataError(
+                f"{name}, step {step}: {column} {i}",
+                expected="a finite number (in float32)",
+                actual=str(values[step, i]),
+            )
+    return s, a, cost
+
+
+def _episode(s: NDArray[Any], a: NDArray[Any], cost: NDArray[Any], terminated: bool) -> EpisodeBuffer:
+    from minari.data_collector import EpisodeBuffer
+
+    last = np.arange(len(a)) == len(a) - 1
+    columns: dict[str, Any] = {
+        "observations": s.astype(np.float32),
+        "actions": a.astype(np.float32),
+        "rewards": -cost,
+        "terminations": last & terminated,
+        "truncations": last & (not terminated),
+        "infos": {"cost": np.concatenate([[0.0], cost])[:, None], "state": s},
+    }
+    return EpisodeBuffer(**columns)
+
+
+def from_csv(
+    path: str | Path,
+    *,
+    observations: Sequence[str],
+    actions: Sequence[str],
+    cost: Cost | str,
+    episode: str | None = None,
+    time: str | None = None,
+    dt: float | None = None,
+    split_gaps: bool = False,
+    delimiter: str = ",",
+    dataset_id: str | None = None,
+) -> TransitionTable:
+    """Reads the log of a real plant: a text table with a header, one row a sampling instant.
+
+    Row k holds the observation s_k and the action a_k that acts until row k+1; so the last row of an episode gives
+    only the s+ of the one before it, and episodes end cut off, not terminated.
+
+    Args:
+        path: The file.
+        observations: Names of the columns of s, ``ny``.
+        actions: Names of the columns of a, ``nu``.
+        cost: L(s, a) for arrays ``(n, ny)`` and ``(n, nu)``, giving ``(n,)``; or the name of a column.
+        episode: Name of a column that says which episode a row belongs to (any text); by default all are one.
+        time: Name of the column of the time in seconds, to check the sampling time.
+        dt: The sampling time in seconds; rows must be this far apart, to 1 %.
+        split_gaps: Whether a row at another distance begins a new episode instead of being an error.
+        delimiter: What separates columns.
+        dataset_id: Also stores the log as a Minari data set of this id.
+
+    Returns:
+        The transitions.
+
+    Raises:
+        InvalidArgumentError: For ``time`` without ``dt`` or the reverse, no columns, or a bad id.
+        InvalidDataError: For a missing column, a cell that is not a finite number, rows that do not follow each other
+            by ``dt``, an episode in two pieces, or costs of another shape; names line and column.
+    """
+    if (time is None) != (dt is None) or (dt is not None and not dt > 0.0):
+        raise InvalidArgumentError("time, dt", expected="both or neither, dt > 0", actual=f"{time!r}, {dt}")
+    if not observations or not actions or isinstance(observations, str) or isinstance(actions, str):
+        raise InvalidArgumentError(
+            "observations, actions", expected="lists of column names", actual=f"{observations!r}, {actions!r}"
+        )
+    name = f"file {path}"
+    numbers = [*observations, *actions, *([time] if time else []), *([cost] if isinstance(cost, str) else [])]
+    values, labels, lines = _read(Path(path), name, numbers, episode, delimiter)
+    starts = _starts(name, labels, lines, episode)
+    ny, nu = len(observations), len(actions)
+    if dt is not None:
+        gaps = np.diff(values[:, ny + nu])
+        wrong = (np.abs(gaps - dt) > 0.01 * dt) & ~starts[1:]
+        if wrong.any() and not split_gaps:
+            row = int(np.flatnonzero(wrong)[0]) + 1
+            raise InvalidDataError(
+                f"{name}, line {lines[row]}: {time}",
+                expected=f"{dt:g} s more than the row before",
+                actual=f"{gaps[row - 1]:g} s ({int(wrong.sum())} such rows)",
+                hint="Name the column that tells episodes apart, or pass split_gaps=True.",
+            )
+        starts[1:] |= wrong
+    goes_on = np.flatnonzero(~starts[1:])
+    if len(goes_on) == 0:
+        raise InvalidDataError(name, expected="two rows of one episode", actual=f"{len(values)} rows in as many")
+    s, a = values[:, :ny], values[:, ny : ny + nu]
+    costs = values[goes_on, -1] if isinstance(cost, str) else np.asarray(cost(s[goes_on], a[goes_on]), np.float64)
+    if costs.shape != goes_on.shape or not np.isfinite(costs).all():
+        bad = costs.shape == goes_on.shape
+        where = f", line {lines[goes_on[np.flatnonzero(~np.isfinite(costs))[0]]]}" if bad else ""
+        raise InvalidDataError(
+            f"{name}{where}: cost(s, a)",
+            expected=f"finite numbers of shape {goes_on.shape}",
+            actual=str(costs[~np.isfinite(costs)][0]) if bad else f"shape {costs.shape}",
+        )
+    ids = np.cumsum(starts) - 1
+    table = TransitionTable.from_arrays(
+        s[goes_on], a[goes_on], costs, s[goes_on + 1], np.zeros(len(goes_on)), ids[goes_on], name=name
+    )
+    if dataset_id is not None:
+        pieces = [goes_on[ids[goes_on] == i] for i in np.unique(ids[goes_on])]
+        order = np.searchsorted(goes_on, np.concatenate(pieces))
+        ends = np.cumsum([len(piece) for piece in pieces])
+        parts = np.split(costs[order], ends[:-1])
+        dataset_from_arrays(
+            dataset_id,
+            [(s[k[0] : k[-1] + 2], a[k], c) for k, c in zip(pieces, parts, strict=True)],
+            description=f"Log {Path(path).name}.",
+        )
+    return table
+
+
+def _read(
+    path: Path, name: str, columns: list[str], episode: str | None, delimiter: str
+) -> tuple[NDArray[np.float64], list[str], list[int]]:
+    """Numbers ``(n, len(columns))``, each row's episode, and its line in the file."""
+    rows: list[list[float]] = []
+    labels: list[str] = []
+    lines: list[int] = []
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(file, delimiter=delimiter)
+        try:
+            header = [cell.strip() for cell in next(reader, [])]
+            places = []
+            for column in [*columns, *([episode] if episode else [])]:
+                if header.count(column) != 1:
+                    raise InvalidDataError(
+                        f"{name}, line 1: column {column!r}",
+                        expected=f"one of that name among {', '.join(header) or '(none)'}",
+                        actual=str(header.count(column)),
+                    )
+                places.append(header.index(column))
+            for row in reader:
+                if not row:
+                    continue
+                if len(row) != len(header):
+                    raise InvalidDataError(
+                        f"{name}, line {reader.line_num}", expected=f"{len(header)} columns", actual=str(len(row))
+                    )
+                rows.append([_number(name, reader.line_num, c, row[i]) for c, i in zip(columns, places, strict=False)])
+                labels.append(row[places[-1]].strip() if episode else "")
+                lines.append(reader.line_num)
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise InvalidDataError(
+                f"{name}, line {reader.line_num + 1}", expected="a text table", actual=str(error)
+            ) from error
+    if not rows:
+        raise InvalidDataError(name, expected="at least two rows", actual="none")
+    return np.array(rows), labels, lines
+
+
+def _number(name: str, line: int, column: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InvalidDataError(f"{name}, line {line}: column {column!r}", expected="a finite number", actual=repr(cell))
+    return value
+
+
+def _starts(name: str, labels: list[str], lines: list[int], episode: str | None) -> NDArray[np.bool_]:
+    """Whether each row begins an episode, ``(n,)``."""
+    starts = np.array([True, *(b != a for a, b in itertools.pairwise(labels))])
+    seen: set[str] = set()
+    for row in np.flatnonzero(starts):
+        if labels[row] in seen:
+            raise InvalidDataError(
+                f"{name}, line {lines[row]}: column {episode!r}",
+                expected="the rows of an episode in one piece",
+                actual=f"episode {labels[row]!r} again",
+            )
+        seen.add(labels[row])
+    return starts
