@@ -47,6 +47,15 @@ _FORMATS = {
 def source(mpc: MPC) -> str:
     """The complete C source for an MPC; horizon, discount, bounds and theta are arguments of the compiled functions.
 
+    Raises:
+        InvalidArgumentError: If a function of the MPC cannot be expanded to SX or has no counterpart in C.
+    """
+    return "\n\n".join([text("vector.h"), generated(mpc), text("core.c"), text("kernel.c")])
+
+
+def generated(mpc: MPC) -> str:
+    """The functions that ``core.c`` expects, of ``vd``: a double, or a vector of them.
+
     What depends on theta alone is computed once a problem, in ``gen_prepare``; the products of the Riccati recursion
     are generated too, so that zeros in the model's derivatives cost nothing.
 
@@ -75,11 +84,8 @@ def source(mpc: MPC) -> str:
     parameters = ca.vertcat(theta, symbols)
     parts = [
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
-        _text("vector.h"),
         emit("gen_prepare", [theta], prepared),
         *(emit(name, [*inputs[name], parameters], body) for name, body in zip(outputs, bodies, strict=True)),
-        _text("core.c"),
-        _text("kernel.c"),
     ]
     return "\n\n".join(parts)
 
@@ -153,6 +159,8 @@ def emit(name: str, inputs: list[ca.SX], output: ca.SX) -> str:
     arguments = ", ".join(f"const vd *i{k}" for k in range(len(inputs)))
     lines = [f"static void {name}({arguments}, vd *out) {{"]
     lines.append("    vd " + ", ".join(f"w{k}" for k in range(max(1, function.sz_w()))) + ";")
+    read = {sources[0] for op, sources, _, _ in instructions(function) if op == ca.OP_INPUT}
+    lines.extend(f"    (void)i{k};" for k in range(len(inputs)) if k not in read)
     for op, sources, targets, constant in instructions(function):
         if op == ca.OP_CONST:
             lines.append(f"    w{targets[0]} = V({_literal(constant)});")
@@ -175,5 +183,6 @@ def _literal(value: float) -> str:
     return repr(float(value))
 
 
-def _text(name: str) -> str:
+def text(name: str) -> str:
+    """A C file of this package."""
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")

@@ -113,7 +113,8 @@ class DDPSolver(Solver):
             mpc.horizon, mpc.discount, self._low.ctypes.data, self._high.ctypes.data, max_iterations, tolerance
         )
         self._candidates = np.ascontiguousarray(candidate_inputs(mpc))
-        self._n_starts, self._n_threads = n_starts, n_threads
+        self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
+        self._n_threads = n_threads
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
         start = time.perf_counter()
@@ -186,7 +187,7 @@ class DDPSolver(Solver):
         def work(first: int) -> int:
             if not cold:
                 return int(library.mpc_solve(problem, arguments, first, workers))
-            starts = self._candidates.ctypes.data, len(self._candidates), self._n_starts
+            starts = self._candidates.ctypes.data, len(self._candidates), self.n_starts
             return int(library.mpc_solve_cold(problem, arguments, *starts, first, workers))
 
         if workers == 1:
