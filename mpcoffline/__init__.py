@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         InvalidArgumentError,
         InvalidDataError,
         MPCOfflineError,
+        StorageError,
         UnknownIdError,
     )
     from mpcoffline.evaluation import evaluate
@@ -64,6 +65,7 @@ _HOMES = {
     "InvalidArgumentError": "errors",
     "InvalidDataError": "errors",
     "MPCOfflineError": "errors",
+    "StorageError": "errors",
     "UnknownIdError": "errors",
 }
 
@@ -83,6 +85,7 @@ __all__ = [
     "Penalty",
     "QuadraticCost",
     "StateBounds",
+    "StorageError",
     "TransitionTable",
     "UnknownIdError",
     "__version__",
