@@ -137,7 +137,7 @@ def verify(dataset: MinariDataset | str) -> VerifyReport:
     check_dataset_id(dataset)
     folder = dataset_path(dataset)
     if not is_local(dataset):
-        return _report(load_dataset(dataset), dataset, folder)
+        return _report(load_dataset(dataset, download=False), dataset, folder)
     try:
         return _report(open_dataset(folder), dataset, folder)
     except FileFormatError as error:
