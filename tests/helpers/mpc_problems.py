@@ -85,8 +85,27 @@ def simulated(mpc: MPC, x: ArrayLike, inputs: Array, theta: Array | None = None)
     return np.stack(path, axis=1), cost + weight * mpc.terminal_function(state, p).full().ravel()
 
 
+def residual_and_cost(mpc: MPC, solution: Solution, theta: Array | None = None) -> tuple[Array, Array]:
+    """How far each step is from the model's, relative to its states, and the cost along the trajectory, ``(B,)`` each.
+
+    Step by step, as far-out states can be chaotic: re-simulated as a whole they differ by rounding alone.
+    """
+    with np.errstate(all="ignore"):  # of rows that are no solutions
+        return _residual_and_cost(mpc, solution, mpc.theta if theta is None else theta)
+
+
+def _residual_and_cost(mpc: MPC, solution: Solution, p: Array) -> tuple[Array, Array]:
+    error, cost = np.zeros(len(solution.x)), np.zeros(len(solution.x))
+    for k in range(mpc.horizon):
+        x, u = solution.x[:, k], solution.u[:, k].T
+        off = np.abs(mpc.dynamics_function(x.T, u, p).full().T - solution.x[:, k + 1]).max(axis=1)
+        error = np.maximum(error, off / (1.0 + np.abs(x).max(axis=1) + np.abs(solution.x[:, k + 1]).max(axis=1)))
+        cost += mpc.discount**k * mpc.stage_function(x.T, u, p).full().ravel()
+    return error, cost + mpc.discount**mpc.horizon * mpc.terminal_function(solution.x[:, -1].T, p).full().ravel()
+
+
 def projected_gradient(mpc: MPC, solution: Solution, theta: Array | None = None) -> Array:
-    """Largest component of the gradient of J by the inputs that does not push against a bound, ``(B,)``.
+    """Largest component of the projected gradient of J by the inputs, |u - clip(u - dJ/du)|, ``(B,)``.
 
     By the adjoint recursion lambda = gamma f_x' lambda+ + L_x.
     """
@@ -103,8 +122,6 @@ def projected_gradient(mpc: MPC, solution: Solution, theta: Array | None = None)
         inputs = solution.u[:, k]
         adjoint_next, gradient = (v.full() for v in back(solution.x[:, k].T, inputs.T, adjoint, p))
         adjoint = adjoint_next
-        g = gradient.T
-        near = 1e-12 * (1.0 + np.abs(inputs))  # rounding: u + (low - u) is not always low
-        g = np.where((inputs <= low + near) & (g > 0), 0.0, np.where((inputs >= high - near) & (g < 0), 0.0, g))
+        g = np.abs(inputs - np.clip(inputs - gradient.T, low, high))  # as far as the bounds let it
         largest = np.maximum(largest, mpc.discount**k * np.abs(g).max(axis=1))
     return largest
