@@ -17,6 +17,7 @@ from mpcoffline.mpc import MPC
 
 from .interface import Array
 
+_TOUCHING = 1e-9  # distance from a bound that counts as none, relative to 1 + |u|
 _SINGULAR = 1e-13  # of a Hessian's diagonal, below which a pivot counts as zero
 
 
@@ -84,6 +85,15 @@ class LinearQuadratic:
         names = ("A", "B", "c", "H", "h", "offset")
         return replace(self, **{name: getattr(self, name)[1:] for name in names})
 
+    def rollout(self, x: Array, u: Array) -> Array:
+        """States ``(B, N + 1, nx)`` from states ``(B, nx)`` under inputs ``(B, N, nu)``."""
+        driven = _times(self.B, u) + self.c
+        states = np.empty((len(x), self.horizon + 1, x.shape[1]))
+        states[:, 0] = x
+        for k in range(self.horizon):
+            states[:, k + 1] = states[:, k] @ self.A[k].T + driven[:, k]
+        return states
+
     def cost(self, x: Array, u: Array) -> Array:
         """The objective of (MPC), ``(B,)``, of states ``(B, N + 1, nx)`` and inputs ``(B, N, nu)``."""
         z = np.concatenate([x[:, :-1], u], axis=2)
@@ -121,11 +131,16 @@ class LinearQuadratic:
         own, ahead = _times(self.H, z) + h, self.discount * _times(AB.transpose(0, 2, 1), costates[:, 1:])
         gradient = own + ahead
         last = costates[:, -1] - (x[:, -1] @ self.W + w)
-        step = np.clip(u - gradient[:, :, nx:], low, high) - u  # zero where u is optimal within its bounds
+        slope = gradient[:, :, nx:]
+        room = np.where(slope > 0.0, u - low, high - u)  # in the direction of descent
+        slope = np.where(room <= _TOUCHING * (1.0 + np.abs(u)), 0.0, slope)
         adjoint = gradient[:, :, :nx] - costates[:, :-1]
+        # Stage by stage: where the states grow along the horizon, the last ones must not hide the errors of the first.
         scale = 1.0 + _largest(own) + _largest(ahead)
-        unmet = np.maximum.reduce([_largest(adjoint), _largest(last), _largest(step)]) / scale
-        return np.asarray(np.maximum(unmet, _largest(dynamics) / (1.0 + _largest(z))))
+        stages = np.maximum(_largest(adjoint), _largest(slope)) / scale
+        stages = np.maximum(stages, _largest(dynamics) / (1.0 + _largest(z)))
+        end = _largest(last) / (1.0 + _largest(costates[:, -1]))
+        return np.asarray(np.maximum(stages.max(axis=1, initial=0.0), end))
 
 
 class Extraction:
@@ -263,21 +278,21 @@ class Riccati:
         return np.vstack(states).T.copy(), (np.vstack(inputs).T.copy() if inputs else np.zeros((nx + 1, 0)))
 
     @cached_property
-    def responses(self) -> tuple[Array, Array]:
-        """F ``((N + 1) nx, N nu)`` and G ``(N nu, N nu)``: departures w add F w to the states and G w to the inputs.
+    def response(self) -> Array:
+        """G ``(N nu, N nu)``: departures w add G w to the inputs.
 
         They cost |w|^2, as w_k = gamma^(k/2) C_k' nu_k with Muu_k = C_k C_k'. Written in w the QP is a least-distance
         problem, well conditioned also where the model is unstable.
         """
         problem = self.problem
         n, nx, nu = problem.B.shape
-        F, G = np.zeros(((n + 1) * nx, n * nu)), np.zeros((n * nu, n * nu))
+        G, state = np.zeros((n * nu, n * nu)), np.zeros((nx, n * nu))
         for k in range(n):
-            block, state = slice(k * nu, (k + 1) * nu), F[k * nx : (k + 1) * nx]
+            block = slice(k * nu, (k + 1) * nu)
             G[block] = self.K[k] @ state
             G[block, block] += np.linalg.inv(self._factors[k]).T * problem.discount ** (-k / 2)
-            F[(k + 1) * nx : (k + 2) * nx] = problem.A[k] @ state + problem.B[k] @ G[block]
-        return F, G
+            state = problem.A[k] @ state + problem.B[k] @ G[block]
+        return G
 
 
 def _cholesky(matrix: Array) -> Array | None:
@@ -298,5 +313,5 @@ def _times(matrices: Array, vectors: Array) -> Array:
 
 
 def _largest(array: Array) -> Array:
-    """The largest magnitude of each problem, ``(B,)``."""
-    return np.asarray(np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0))
+    """The largest magnitude along the last axis."""
+    return np.asarray(np.abs(array).max(axis=-1, initial=0.0))

@@ -30,8 +30,10 @@ class LQRSolver(Solver):
     For each theta the discounted Riccati recursion is run once and kept; a batch of problems is then one matrix
     product. Where that solution leaves the input bounds, a QP in the departures from it is solved by daqp, a dual
     active-set method, which finds the active bounds and with them the exact solution; a warm start says which bounds
-    to try first. ``success`` says that the first-order conditions hold along the trajectory, which is decisive as the
-    problem is convex; ``stats["residual"]`` says how well, relative to the size of their terms.
+    to try first. Where daqp fails (unstable models that saturated inputs cannot hold), ipopt takes over.
+
+    ``success`` says that the first-order conditions hold along the trajectory, which is decisive as the problem is
+    convex; ``stats["residual"]`` says how well, relative to the size of their terms.
 
     A theta whose Hessian with respect to the inputs is singular or indefinite at some stage (inputs free of cost
     that also change nothing that costs) has no unique solution: its problems are passed on to ipopt, and
@@ -153,7 +155,8 @@ class _Controller:
             program, rest = self._program(imposed, riccati), riccati.problem
             for i in rows:
                 guess = warm_start.u[i, skipped:]
-                states[i], inputs[i], iterations[i], status[i] = program.solve(states[i], inputs[i], guess)
+                inputs[i], iterations[i], status[i] = program.solve(inputs[i], guess)
+            states[rows] = rest.rollout(begin[rows], inputs[rows])
             bounded = states[rows], inputs[rows]
             value[rows] = rest.cost(*bounded)
             residual[rows] = rest.optimality(*bounded, rest.costates(*bounded), self._low, self._high)
@@ -173,7 +176,7 @@ class _Controller:
 
     def _program(self, imposed: bool, riccati: Riccati) -> _BoundedInputs:
         if imposed not in self._programs:
-            self._programs[imposed] = _BoundedInputs(*riccati.responses, self._low, self._high)
+            self._programs[imposed] = _BoundedInputs(riccati.response, self._low, self._high)
         return self._programs[imposed]
 
 
@@ -181,15 +184,14 @@ class _BoundedInputs:
     """The QP min |w|^2 with low <= u + G w <= high, u being the inputs without bounds.
 
     Args:
-        F: What w adds to the states, ``((N + 1) nx, N nu)``, see :attr:`Riccati.responses`.
-        G: What w adds to the inputs, ``(N nu, N nu)``.
+        G: What w adds to the inputs, ``(N nu, N nu)``, see :attr:`Riccati.response`.
         low: ``(nu,)``.
         high: ``(nu,)``.
     """
 
-    def __init__(self, F: Array, G: Array, low: Array, high: Array) -> None:
+    def __init__(self, G: Array, low: Array, high: Array) -> None:
         n = len(G)
-        self._F, self._G, self._low, self._high = F, G, low, high
+        self._G, self._low, self._high = G, low, high
         self._model = daqp.Model()
         self._model.settings = _SETTINGS
         wide = np.full(n, _INFINITE)
@@ -197,11 +199,10 @@ class _BoundedInputs:
         self._data = (np.eye(n), np.zeros(n), np.ascontiguousarray(G), wide, -wide, np.zeros(n, dtype=np.intc))
         self._model.setup(*self._data)
 
-    def solve(self, x: Array, u: Array, guess: Array) -> tuple[Array, Array, int, str]:
-        """States, inputs, iterations and status of the best inputs within the bounds.
+    def solve(self, u: Array, guess: Array) -> tuple[Array, int, str]:
+        """The best inputs within the bounds ``(N, nu)``, iterations and status.
 
         Args:
-            x: The states without bounds, ``(N + 1, nx)``.
             u: The inputs without bounds, ``(N, nu)``.
             guess: Inputs of a plan ``(N, nu)``, whose active bounds are tried first; NaN for none.
         """
@@ -214,10 +215,10 @@ class _BoundedInputs:
         w, _, flag, info = self._model.solve()
         iterations = int(info["iterations"])
         if flag <= 0 or not np.isfinite(w).all():
-            return x, u, iterations, f"daqp ({_REASONS.get(flag, flag)})"
-        inputs = u + (self._G @ w).reshape(u.shape)
-        # What the clipping moves, within the tolerance of the QP, is checked as a residual of the dynamics.
-        return x + (self._F @ w).reshape(x.shape), np.clip(inputs, self._low, self._high), iterations, "QP"
+            # A guess that the conditions of an optimum then confirm, or refute.
+            reason = f"clipped Riccati, as daqp says {_REASONS.get(flag, flag)}"
+            return np.clip(u, self._low, self._high), iterations, reason
+        return np.clip(u + (self._G @ w).reshape(u.shape), self._low, self._high), iterations, "QP"
 
 
 def _empty(n: int, mpc: MPC) -> Solution:

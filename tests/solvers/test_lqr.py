@@ -307,3 +307,21 @@ def test_far_out_states(x: list[float]) -> None:
     assert np.abs(solution.u).max() <= 10.0
     assert solution.success
     assert np.isfinite(solution.value)
+
+
+@pytest.mark.parametrize("seed", [42, 47, 56])
+def test_unstable_models_with_saturated_inputs(seed: int) -> None:
+    """The states grow by 1.65^40: trajectory and value must be those of the inputs all the same."""
+    mpc = random_mpc(seed, bound=0.05, horizon=40)
+    mpc = mpc.with_theta(mpc.space.pack({"model.A": 1.5 * mpc.values["model.A"]}))
+    x = 1e3 * np.random.default_rng(seed).normal(size=(2, mpc.nx))
+    solution = LQRSolver(mpc).solve(x)
+    assert solution.success.any()
+    costs = [rollout_cost(mpc, *row) for row in zip(x, solution.u, strict=True)]
+    np.testing.assert_allclose(solution.value, costs, rtol=1e-9)
+    # No other corner or point of the box is better, as far as a random search sees.
+    rng = np.random.default_rng(0)
+    for state, u, value, success in zip(x, solution.u, solution.value, solution.success, strict=True):
+        for scale in (1e-3, 0.1, 1.0):
+            other = np.clip(u + scale * 0.05 * rng.normal(size=u.shape), -0.05, 0.05)
+            assert not success or rollout_cost(mpc, state, other) >= value - 1e-9 * abs(value)
