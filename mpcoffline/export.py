@@ -149,8 +149,9 @@ _HEADER = """\
  * y: the policy's observation (the MPC's state), @NX@ numbers. u: the action, @NU@ numbers:
 @BOUNDS@
  *
- * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations, the first after a reset
- * MPC_STARTS times as many. An iteration costs the same each time, up to the 10 trial steps of its line search.
+ * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
+ * one whose warm start led nowhere, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a sixth of
+ * them. An iteration costs the same each time, up to the 10 trial steps of its line search.
  */
 #ifndef MPC_CONTROLLER_H
 #define MPC_CONTROLLER_H
@@ -178,6 +179,8 @@ typedef struct {
     int has_plan;
     double x[(MPC_HORIZON + 1) * MPC_NX], u[MPC_HORIZON * MPC_NU];
     double old_x[(MPC_HORIZON + 1) * MPC_NX], old_u[MPC_HORIZON * MPC_NU];
+    double start_x[(MPC_STARTS + 5) / 6][(MPC_HORIZON + 1) * MPC_NX];
+    double start_u[(MPC_STARTS + 5) / 6][MPC_HORIZON * MPC_NU];
     double work_x[(MPC_HORIZON + 1) * MPC_NX], work_u[MPC_HORIZON * MPC_NU];
     double work_x_new[(MPC_HORIZON + 1) * MPC_NX], work_u_new[MPC_HORIZON * MPC_NU];
     double work_k[MPC_HORIZON * MPC_NU], work_K[MPC_HORIZON * MPC_NU * MPC_NX];

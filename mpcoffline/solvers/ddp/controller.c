@@ -22,10 +22,13 @@ static void keep(mpc_state *state, const lanes *w) {
     for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->x[i] = w->x[i];
 }
 
-/* Solves from the MPC_STARTS cheapest candidates and keeps the best solution; whether there is one. */
+/* Solves from the MPC_STARTS cheapest candidates: a few iterations each, the best go on, the best solution is kept.
+ * Returns whether there is one. */
 static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
-    double J[N_CANDIDATES], best = INFINITY;
-    int best_converged = 0, any = 0;
+    double J[N_CANDIDATES], lead[FINALISTS(MPC_STARTS)], best = INFINITY;
+    int best_converged = 0;
+    mpc_problem race = *m;
+    if (race.max_iterations > RACE_ITERATIONS) race.max_iterations = RACE_ITERATIONS;
     for (int c = 0; c < N_CANDIDATES; ++c) {
         for (int k = 0; k < MPC_HORIZON; ++k)
             for (int a = 0; a < NU; ++a) w->u[k * NU + a] = candidate(c, k, a);
@@ -33,7 +36,7 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
         if (!(J[c] < INFINITY)) J[c] = INFINITY;
     }
     for (int start = 0; start < MPC_STARTS; ++start) {
-        int cheapest = 0;
+        int cheapest = 0, place = start;
         for (int c = 1; c < N_CANDIDATES; ++c)
             if (J[c] < J[cheapest]) cheapest = c;
         J[cheapest] = INFINITY;
@@ -41,14 +44,33 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
             for (int a = 0; a < NU; ++a)
                 w->u[k * NU + a] = clip(candidate(cheapest, k, a), m->low[a], m->high[a]);
         w->J = rollout_open(m, w, w->x, w->u);
+        solve(&race, w);
+        if (!(w->J < INFINITY)) w->J = INFINITY;
+        if (start >= FINALISTS(MPC_STARTS)) { /* in place of the worst, if it is better */
+            place = 0;
+            for (int l = 1; l < FINALISTS(MPC_STARTS); ++l)
+                if (lead[l] > lead[place]) place = l;
+            if (!(w->J < lead[place])) continue;
+        }
+        lead[place] = w->J;
+        for (int i = 0; i < MPC_HORIZON * NU; ++i) state->start_u[place][i] = w->u[i];
+        for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->start_x[place][i] = w->x[i];
+    }
+    for (int l = 0; l < FINALISTS(MPC_STARTS); ++l) {
+        int first = 0;
+        for (int other = 1; other < FINALISTS(MPC_STARTS); ++other)
+            if (lead[other] < lead[first]) first = other;
+        lead[first] = INFINITY;
+        for (int i = 0; i < MPC_HORIZON * NU; ++i) w->u[i] = state->start_u[first][i];
+        for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w->x[i] = state->start_x[first][i];
+        w->J = INFINITY;
         int converged = solve(m, w) == CONVERGED;
         /* A converged solution that is as good as the best goes before one that is not. */
         double slack = 1e-6 * (1.0 + fabs(best));
         int closer = converged && !best_converged && w->J < best + slack;
-        if (!any || closer || w->J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY)) {
+        if (closer || w->J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY)) {
             best = w->J;
             best_converged = converged;
-            any = 1;
             keep(state, w);
         }
     }

@@ -138,7 +138,15 @@ int mpc_solve(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t s
     return solve_range(m, b, first, stride);
 }
 
-/* Cold solve of one problem from the LANES cheapest candidates; the best solution goes to row i of the batch. */
+static void swap(double *a, double *b, int64_t n) {
+    for (int64_t k = 0; k < n; ++k) {
+        double kept = a[k];
+        a[k] = b[k];
+        b[k] = kept;
+    }
+}
+
+/* Cold solve of one problem from the cheapest candidates; the best solution goes to row i of the batch. */
 static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
                       int64_t n_candidates, double *J, lanes *w, const mpc_batch *starts) {
     int64_t N = m->horizon, best = 0;
@@ -154,9 +162,28 @@ static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const
         memcpy((double *)starts->theta + l * NP, b->theta + i * NP, NP * sizeof(double));
         if (u0) memcpy((double *)starts->u0 + l * NU, u0, NU * sizeof(double));
     }
-    if (solve_range(m, starts, 0, 1)) return 1;
+    /* A few iterations show which starts lead somewhere; only the best go on. */
+    mpc_problem race = *m;
+    if (race.max_iterations > RACE_ITERATIONS) race.max_iterations = RACE_ITERATIONS;
+    if (solve_range(&race, starts, 0, 1)) return 1;
     int64_t iterations = 0;
     for (int64_t l = 0; l < starts->n; ++l) {
+        iterations += starts->iterations[l];
+        if (!(starts->J[l] < INFINITY)) starts->J[l] = INFINITY;
+    }
+    mpc_batch finals = *starts;
+    finals.n = FINALISTS(starts->n);
+    finals.cold = 0;
+    for (int64_t l = 0; l < finals.n; ++l) {
+        int64_t lead = l;
+        for (int64_t other = l + 1; other < starts->n; ++other)
+            if (starts->J[other] < starts->J[lead]) lead = other;
+        swap(starts->J + l, starts->J + lead, 1);
+        swap(starts->u + l * N * NU, starts->u + lead * N * NU, N * NU);
+        swap(starts->x + l * (N + 1) * NX, starts->x + lead * (N + 1) * NX, (N + 1) * NX);
+    }
+    if (solve_range(m, &finals, 0, 1)) return 1;
+    for (int64_t l = 0; l < finals.n; ++l) {
         iterations += starts->iterations[l];
         /* A converged solution that is as good as the best goes before one that is not. */
         double slack = 1e-6 * (1.0 + (starts->J[best] < 0 ? -starts->J[best] : starts->J[best]));
