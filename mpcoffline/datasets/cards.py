@@ -70,7 +70,7 @@ def write_card(dataset: MinariDataset, recipe: Recipe, scores: Sequence[AgentSco
     states, actions = _visited(dataset)
     costs = -return_curve(dataset)
     _save(return_figure(costs, scores), folder / f"{recipe.task}_returns.png")
-    _save(coverage_figure(recipe.task, states, actions), folder / f"{recipe.task}_coverage.png")
+    _save(coverage_figure(PANELS[recipe.task], states, actions), folder / f"{recipe.task}_coverage.png")
     card = folder / f"{recipe.task}.md"
     card.write_text(_card_text(recipe, costs, states, actions, scores), encoding="utf-8")
     return card
@@ -114,20 +114,21 @@ def return_figure(costs: NDArray[np.float64], scores: Sequence[AgentScore]) -> F
     return figure
 
 
-def coverage_figure(task: str, states: NDArray[np.float64], actions: NDArray[np.float64]) -> Figure:
+def coverage_figure(
+    panels: Sequence[tuple[Axis, Axis]], states: NDArray[np.float64], actions: NDArray[np.float64]
+) -> Figure:
     """Where the data lie: two-dimensional histograms of states and actions, logarithmic colours.
 
     Args:
-        task: One of the tasks.
+        panels: Horizontal and vertical axis of each histogram, e.g. :data:`PANELS` of a task.
         states: Visited states s, ``(n, nx)``.
         actions: The actions taken there, ``(n, nu)``.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    panels = PANELS[task]
     figure = Figure(figsize=(3.1 * len(panels) + 0.5, 2.9), layout="constrained")
-    norm = LogNorm(1, len(states) / 20)
+    norm = LogNorm(1, max(2.0, len(states) / 20))
     image: Any = None
     axes_list: list[Axes] = []
     for i, (horizontal, vertical) in enumerate(panels):

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from mpcoffline.datasets import TransitionTable, collect
-from mpcoffline.datasets.cards import coverage_figure, return_figure, write_card
+from mpcoffline.datasets.cards import PANELS, coverage_figure, return_figure, write_card
 from mpcoffline.datasets.collection import collect_with, make_agent, return_curve, score_agent
 from mpcoffline.datasets.packed import packed_size
 from mpcoffline.datasets.recipes import TASKS, Recipe
@@ -183,7 +183,7 @@ def test_figures_hold_the_numbers() -> None:
     assert axes.get_yscale() == "linear"
     assert return_figure(np.r_[1e5, costs], []).axes[0].get_yscale() == "log"
     rng = np.random.default_rng(0)
-    figure = coverage_figure("pendulum", rng.uniform(-1, 1, (1000, 2)), rng.uniform(-2, 2, (1000, 1)))
+    figure = coverage_figure(PANELS["pendulum"], rng.uniform(-1, 1, (1000, 2)), rng.uniform(-2, 2, (1000, 1)))
     counts = [axes.collections[0].get_array() for axes in figure.axes[:2]]
     assert [int(count.sum()) for count in counts] == [1000, 1000]
 
