@@ -30,8 +30,18 @@ def checked_episode_ids(name: str, values: ArrayLike, length: int) -> NDArray[np
     return ids.astype(np.int64)
 
 
-def check_finite(name: str, rows: NDArray[np.float32], ny: int, nu: int, episode_ids: NDArray[np.int64] | None) -> None:
-    """Refuses the first NaN or inf of packed rows ``(n, 2 ny + nu + 2)`` with ``InvalidDataError``."""
+def check_finite(
+    name: str,
+    rows: NDArray[np.float32],
+    ny: int,
+    nu: int,
+    episode_ids: NDArray[np.int64] | None,
+    steps_before: int = 0,
+) -> None:
+    """Refuses the first NaN or inf of packed rows ``(n, 2 ny + nu + 2)`` with ``InvalidDataError``.
+
+    Where they are a block of a longer table, ``steps_before`` of its first episode's steps are in earlier blocks.
+    """
     bad = ~np.isfinite(rows)
     if not bad.any():
         return
@@ -39,17 +49,17 @@ def check_finite(name: str, rows: NDArray[np.float32], ny: int, nu: int, episode
     labels += [f"next observation {i}" for i in range(ny)] + ["termination"]
     row, column = (int(i) for i in np.argwhere(bad)[0])
     raise InvalidDataError(
-        f"{name}, {place(episode_ids, row)}: {labels[column]}",
+        f"{name}, {place(episode_ids, row, steps_before)}: {labels[column]}",
         expected="a finite number (in float32)",
         actual=f"{rows[row, column]} ({int(bad.any(axis=1).sum())} such rows)",
         hint="Remove these transitions, or find out how they came to be.",
     )
 
 
-def place(episode_ids: NDArray[np.int64] | None, row: int) -> str:
+def place(episode_ids: NDArray[np.int64] | None, row: int, steps_before: int = 0) -> str:
     """Where a row stands, in words: its episode and the step within, or its number."""
     if episode_ids is None:
         return f"row {row}"
     episode = int(episode_ids[row])
     step = row - int(np.flatnonzero(episode_ids == episode)[0])
-    return f"episode {episode}, step {step}"
+    return f"episode {episode}, step {step + (steps_before if episode == episode_ids[0] else 0)}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,30 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
 from .checks import check_finite, checked_episode_ids, floats, place
+from .sampler import block_batches, gather_batches
+from .table_build import read_minari
+from .table_cache import TableFile, default_cache, default_memory, scratch_table
+from .table_math import CHUNK, Columns, TableStatistics, innermost, moments
+
+__all__ = ["Columns", "TableStatistics", "TransitionTable"]
 
 if TYPE_CHECKING:
     import torch
     from minari import MinariDataset
-
-Block = TypeVar("Block")
-
-
-class Columns(NamedTuple):
-    """The five columns of a block of rows, as views of it (numpy or torch, whichever the block is).
-
-    Attributes:
-        observations: s, ``(B, ny)``.
-        actions: a, ``(B, nu)``.
-        costs: L(s, a), ``(B,)``.
-        next_observations: s+, ``(B, ny)``.
-        terminations: 1.0 where the episode terminated in s+ (no bootstrapping there), else 0.0, ``(B,)``.
-    """
-
-    observations: Any
-    actions: Any
-    costs: Any
-    next_observations: Any
-    terminations: Any
 
 
 class TransitionTable:
@@ -53,12 +40,28 @@ class TransitionTable:
         nu: Number of action coordinates.
         episode_ids: Episode of each row, ``(n,)``; rows of an episode are contiguous and in time order.
         name: What error messages call this table, e.g. the data set's id.
+        file: Where the rows are a memory map, the file that they are in.
+        memory: Bytes that sampling a mapped table may occupy; a quarter of the machine's memory by default.
     """
 
     def __init__(
-        self, rows: NDArray[np.float32], ny: int, nu: int, episode_ids: NDArray[np.int64], name: str = "table"
+        self,
+        rows: NDArray[np.float32],
+        ny: int,
+        nu: int,
+        episode_ids: NDArray[np.int64],
+        name: str = "table",
+        *,
+        file: TableFile | None = None,
+        memory: int | None = None,
     ) -> None:
         self.rows, self.ny, self.nu, self.episode_ids, self.name = rows, ny, nu, episode_ids, name
+        self._file, self._memory = file, memory
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether the rows are in a file rather than in memory."""
+        return self._file is not None
 
     def __len__(self) -> int:
         """Number of transitions n."""
@@ -175,49 +178,72 @@ class TransitionTable:
         return table
 
     @classmethod
-    def from_minari(cls, dataset: MinariDataset | str) -> TransitionTable:
+    def from_minari(
+        cls, dataset: MinariDataset | str, *, memory: int | None = None, cache: str | Path | None = None
+    ) -> TransitionTable:
         """Reads a Minari data set; cost = -reward.
+
+        Large tables (from 500,000 rows on) are kept in a cache outside the data set, under the SHA-256 of its file,
+        so that they are built once. A table larger than ``memory`` stays in the cache's file: its rows are
+        a memory map, and :meth:`batches` shuffles it block by block.
 
         Args:
             dataset: The data set, or its id (local or shipped).
+            memory: Bytes; by default a quarter of the machine's memory.
+            cache: The cache's folder; by default ``mpcoffline/tables`` in the user's cache folder.
 
         Raises:
             UnknownIdError: For an unknown id.
             InvalidDataError: For spaces other than a one-dimensional Box, episodes that do not hold one
                 observation more than actions, or data that :meth:`from_arrays` refuses.
+            FileFormatError: For a damaged file.
+            StorageError: Where a table larger than ``memory`` cannot be written.
         """
         if isinstance(dataset, str):
             from .minari_store import load_dataset
 
             dataset = load_dataset(dataset)
         name = f"data set {dataset.spec.dataset_id!r}"
-        for kind, space in (("observation", dataset.observation_space), ("action", dataset.action_space)):
-            if len(space.shape or ()) != 1:
-                raise InvalidDataError(f"{name}: {kind} space", expected="a Box of shape (n,)", actual=str(space))
-        parts: dict[str, list[NDArray[Any]]] = {key: [] for key in ("s", "a", "r", "s_next", "terminated", "id")}
-        for episode in dataset.iterate_episodes():
-            steps = len(episode.actions)
-            for column, found in (
-                ("observations", len(episode.observations) - 1),
-                ("rewards", len(episode.rewards)),
-                ("terminations", len(episode.terminations)),
-            ):
-                if found != steps:
-                    raise InvalidDataError(
-                        f"{name}, episode {episode.id}: {column}",
-                        expected=f"the length that belongs to {steps} actions",
-                        actual=str(len(getattr(episode, column))),
-                    )
-            parts["s"].append(episode.observations[:-1])
-            parts["a"].append(episode.actions)
-            parts["r"].append(episode.rewards)
-            parts["s_next"].append(episode.observations[1:])
-            parts["terminated"].append(episode.terminations)
-            parts["id"].append(np.full(steps, episode.id, dtype=np.int64))
-        if not parts["s"]:
-            raise InvalidDataError(name, expected="at least one episode", actual="none")
-        s, a, r, s_next, terminated, ids = (np.concatenate(arrays) for arrays in parts.values())
-        return cls.from_arrays(s, a, -r.astype(np.float64), s_next, terminated, ids, name=name)
+        memory = default_memory() if memory is None else memory
+        built = read_minari(dataset, name, memory, default_cache() if cache is None else Path(cache))
+        if isinstance(built, TableFile):
+            return cls._of_file(built, name, memory)
+        return cls(built.rows, built.ny, built.nu, built.episode_ids, name)
+
+    @classmethod
+    def concat(cls, tables: Sequence[TransitionTable], *, name: str | None = None) -> TransitionTable:
+        """Several tables as one; episodes are numbered anew, so that those of different tables stay apart.
+
+        Args:
+            tables: At least one table. Where one is mapped, the result is too.
+            name: What error messages call it; the tables' names by default.
+
+        Raises:
+            InvalidArgumentError: For no table at all.
+            InvalidDataError: For tables of different numbers of observations or actions.
+        """
+        if not tables:
+            raise InvalidArgumentError("tables", expected="at least one", actual="none")
+        first = tables[0]
+        blocks, offset = [], 0
+        for table in tables:
+            if (table.ny, table.nu) != (first.ny, first.nu):
+                raise InvalidDataError(
+                    table.name,
+                    expected=f"{first.ny} observations and {first.nu} actions, as in {first.name}",
+                    actual=f"{table.ny} and {table.nu}",
+                )
+            episodes, numbers = np.unique(table.episode_ids, return_inverse=True)
+            blocks += [
+                (table.rows[i : i + CHUNK], numbers[i : i + CHUNK] + offset) for i in range(0, len(table), CHUNK)
+            ]
+            offset += len(episodes)
+        label = name or " + ".join(table.name for table in tables)
+        for table in tables:
+            if table.is_mapped:
+                return table._like(blocks, label)
+        rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        return cls(rows, first.ny, first.nu, ids, label)
 
     def check_fits(
         self,
@@ -278,14 +304,11 @@ class TransitionTable:
         """
         if not 0.0 < fraction <= 1.0:
             raise InvalidArgumentError("fraction", expected="a number in (0, 1]", actual=str(fraction))
-        size = np.abs(self.observations, dtype=np.float64)  # ratios of float32 numbers can overflow
-        scale = np.median(size, axis=0)
-        scale = np.where(scale > 0.0, scale, size.mean(axis=0))
-        scale = np.where(scale > 0.0, scale, 1.0)
-        score = np.maximum(size / scale, np.abs(self.next_observations) / scale).max(axis=1)
-        kept = max(1, round(fraction * len(self)))
-        # Stable, so that ties are broken by order and the result does not depend on the machine.
-        return self._take(np.sort(np.argsort(score, kind="stable")[:kept]))
+        return self._take(innermost(self.rows, self.ny, self.nu, fraction))
+
+    def statistics(self) -> TableStatistics:
+        """Mean, standard deviation and range of every column, in float64, in one pass over the table."""
+        return TableStatistics(*(self._row(values) for values in moments(self.rows)))
 
     def split(self, fraction: float, seed: int) -> tuple[TransitionTable, TransitionTable]:
         """Splits at random by episode, so that no episode is on both sides.
@@ -328,21 +351,29 @@ class TransitionTable:
         """
         if batch_size < 1:
             raise InvalidArgumentError("batch_size", expected="an integer >= 1", actual=str(batch_size))
-        return self._batches(min(batch_size, len(self)), np.random.default_rng(rng), epochs)
-
-    def _batches(self, batch_size: int, rng: np.random.Generator, epochs: int | None) -> Iterator[torch.Tensor]:
-        import torch
-
-        rows = torch.from_numpy(self.rows)
-        epoch = 0
-        while epochs is None or epoch < epochs:
-            order = torch.from_numpy(rng.permutation(len(self)))
-            for start in range(0, len(self) - batch_size + 1, batch_size):
-                yield rows.index_select(0, order[start : start + batch_size])
-            epoch += 1
+        batch_size, generator = min(batch_size, len(self)), np.random.default_rng(rng)
+        if self._file is None:
+            return gather_batches(self.rows, batch_size, generator, epochs)
+        memory = default_memory() if self._memory is None else self._memory
+        return block_batches(self._file, batch_size, generator, epochs, memory)
 
     def _take(self, index: NDArray[np.intp]) -> TransitionTable:
-        return TransitionTable(self.rows[index], self.ny, self.nu, self.episode_ids[index], self.name)
+        if self._file is None:
+            return TransitionTable(self.rows[index], self.ny, self.nu, self.episode_ids[index], self.name)
+        parts = (index[i : i + CHUNK] for i in range(0, len(index), CHUNK))
+        return self._like(((self.rows[part], self.episode_ids[part]) for part in parts), self.name)
+
+    def _like(self, blocks: Iterable[Any], name: str) -> TransitionTable:
+        """A mapped table of these rows and episode ids, in a file that vanishes with it."""
+        cache = default_cache() if self._file is None else self._file.folder.parent
+        return self._of_file(scratch_table(self.ny, self.nu, blocks, cache), name, self._memory)
+
+    @classmethod
+    def _of_file(cls, file: TableFile, name: str, memory: int | None) -> TransitionTable:
+        return cls(file.rows, file.ny, file.nu, file.episode_ids, name, file=file, memory=memory)
+
+    def _row(self, values: NDArray[np.float64]) -> Columns:
+        return Columns(*(column[0] for column in self.columns(values[None, :])))
 
     def _episodes_by_continuity(self) -> NDArray[np.int64]:
         goes_on = (self.next_observations[:-1] == self.observations[1:]).all(axis=1)

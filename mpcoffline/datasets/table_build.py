@@ -1,0 +1,194 @@
+"""From the episodes of a Minari data set to packed rows, block by block."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.errors import FileFormatError, InvalidDataError, StorageError
+
+from .checks import check_finite
+from .hdf5_episodes import EpisodeColumns, read_episodes
+from .table_cache import TableFile, cached_table, content_key, scratch_table
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+BLOCK_BYTES = 1 << 24
+CACHED_ROWS = 500_000
+
+Rows = tuple[NDArray[np.float32], NDArray[np.int64]]
+
+
+class BuiltRows(NamedTuple):
+    """A table in memory: packed rows ``(n, 2 ny + nu + 2)``, the episode of each ``(n,)``, and their sizes."""
+
+    rows: NDArray[np.float32]
+    episode_ids: NDArray[np.int64]
+    ny: int
+    nu: int
+
+
+def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path) -> BuiltRows | TableFile:
+    """The packed rows of a data set, in memory or, if larger than ``memory`` bytes, in a file.
+
+    From :data:`CACHED_ROWS` on they come from the cache, where it holds them intact, and are put there otherwise.
+
+    Raises:
+        InvalidDataError: For data that must not be learned from.
+        FileFormatError: For a damaged file.
+        StorageError: Where the cache cannot be written.
+    """
+    ny, nu = (
+        _size(name, kind, space)
+        for kind, space in (("observation", dataset.observation_space), ("action", dataset.action_space))
+    )
+    steps = int(dataset.total_steps)
+    if steps == 0:
+        raise InvalidDataError(name, expected="at least one episode", actual="none")
+    mapped = steps * 4 * (2 * ny + nu + 2) > memory
+    path = _hdf5_file(dataset)
+    if mapped and path is None:
+        return scratch_table(ny, nu, row_blocks(dataset, name, ny, nu), cache)
+    if path is not None and (mapped or steps >= CACHED_ROWS):
+        try:
+            file = _cached(dataset, name, ny, nu, path, cache)
+            if mapped:
+                return file
+            return _loaded(file) or BuiltRows(*_cached(dataset, name, ny, nu, path, cache).load(), ny, nu)
+        except StorageError as error:
+            if mapped:
+                raise
+            warnings.warn(f"The table is not kept in the cache. {error}", stacklevel=4)
+    return BuiltRows(*_assemble(name, row_blocks(dataset, name, ny, nu), steps, 2 * ny + nu + 2), ny, nu)
+
+
+def _cached(dataset: MinariDataset, name: str, ny: int, nu: int, path: Path, cache: Path) -> TableFile:
+    indices = np.asarray(dataset.episode_indices)
+    whole = len(indices) == dataset.storage.total_episodes and bool((np.diff(indices) == 1).all())
+    key = content_key(path, None if whole else indices, cache)
+    return cached_table(key, ny, nu, row_blocks(dataset, name, ny, nu), cache)
+
+
+def _loaded(file: TableFile) -> BuiltRows | None:
+    """The table in memory; None, and the file is gone, where it is damaged."""
+    try:
+        return BuiltRows(*file.load(), file.ny, file.nu)
+    except FileFormatError as error:
+        warnings.warn(f"{error} It is built again.", stacklevel=5)
+        shutil.rmtree(file.folder, ignore_errors=True)
+        return None
+
+
+def _size(name: str, kind: str, space: Any) -> int:
+    shape = tuple(space.shape or ())
+    if len(shape) != 1:
+        raise InvalidDataError(f"{name}: {kind} space", expected="a Box of shape (n,)", actual=str(space))
+    return int(shape[0])
+
+
+def _hdf5_file(dataset: MinariDataset) -> Path | None:
+    path = Path(dataset.spec.data_path) / "main_data.hdf5"
+    return path if path.is_file() else None
+
+
+def _assemble(
+    name: str, blocks: Iterable[Rows], steps: int, width: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """All blocks in memory, where there are as many rows as the metadata say."""
+    rows, ids, filled = np.empty((steps, width), np.float32), np.empty(steps, np.int64), 0
+    for block, episodes in blocks:
+        if filled + len(block) <= steps:
+            rows[filled : filled + len(block)], ids[filled : filled + len(block)] = block, episodes
+        filled += len(block)
+    if filled != steps:
+        raise InvalidDataError(
+            name,
+            expected=f"{steps} steps, as its metadata say",
+            actual=str(filled),
+            hint="Try `mpcoffline datasets repair`.",
+        )
+    return rows, ids
+
+
+def row_blocks(dataset: MinariDataset, name: str, ny: int, nu: int, block_bytes: int = BLOCK_BYTES) -> Iterator[Rows]:
+    """Yields the packed rows ``(B, 2 ny + nu + 2)`` of a data set and their episodes ``(B,)``, in its order.
+
+    The arrays are used again for the next block. Their size, ``block_bytes`` at most, bounds the memory needed.
+
+    Raises:
+        InvalidDataError: For episodes that do not hold one observation more than actions, other shapes,
+            NaN or inf, or terminations that are not boolean.
+        FileFormatError: For a damaged file.
+    """
+    width = 2 * ny + nu + 2
+    size = max(1, block_bytes // (4 * width + 8))
+    rows, ids = np.empty((size, width), dtype=np.float32), np.empty(size, dtype=np.int64)
+    filled, before = 0, 0
+    for episode_id, columns in _episodes(dataset):
+        where = f"{name}, episode {episode_id}"
+        _check_shapes(where, columns, ny, nu)
+        steps, done = len(columns.actions), 0
+        while done < steps:
+            count = min(steps - done, size - filled)
+            if filled == 0:
+                before = done
+            _pack(rows[filled : filled + count], columns, done, ny, nu)
+            ids[filled : filled + count] = episode_id
+            filled, done = filled + count, done + count
+            if filled == size:
+                check_finite(name, rows, ny, nu, ids, before)
+                yield rows, ids
+                filled = 0
+    if filled:
+        check_finite(name, rows[:filled], ny, nu, ids[:filled], before)
+        yield rows[:filled], ids[:filled]
+
+
+def _episodes(dataset: MinariDataset) -> Iterator[tuple[int, EpisodeColumns]]:
+    path = _hdf5_file(dataset)
+    if path is not None:
+        yield from read_episodes(path, (int(i) for i in dataset.episode_indices))
+        return
+    for episode in dataset.iterate_episodes():  # another storage format
+        parts = (episode.observations, episode.actions, episode.rewards, episode.terminations)
+        yield int(episode.id), EpisodeColumns(*(np.asarray(part) for part in parts))
+
+
+def _pack(rows: NDArray[np.float32], columns: EpisodeColumns, start: int, ny: int, nu: int) -> None:
+    """Writes the steps from ``start`` on into ``rows``; the one place where a reward becomes a cost."""
+    end, after = start + len(rows), ny + nu + 1
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused
+        rows[:, :ny] = columns.observations[start:end]
+        rows[:, ny : ny + nu] = columns.actions[start:end]
+        np.negative(columns.rewards[start:end], out=rows[:, ny + nu], casting="same_kind")
+        rows[:, after : after + ny] = columns.observations[start + 1 : end + 1]
+        rows[:, after + ny] = columns.terminations[start:end]
+
+
+def _check_shapes(where: str, columns: EpisodeColumns, ny: int, nu: int) -> None:
+    steps = len(columns.actions)
+    wanted: dict[str, tuple[int, ...]] = {
+        "observations": (steps + 1, ny),
+        "actions": (steps, nu),
+        "rewards": (steps,),
+        "terminations": (steps,),
+    }
+    for column, shape in wanted.items():
+        found: NDArray[Any] = getattr(columns, column)
+        if found.shape != shape or found.dtype.kind not in "fiub":
+            raise InvalidDataError(
+                f"{where}: {column}",
+                expected=f"the length that belongs to {steps} actions, numbers of shape {shape}",
+                actual=f"{found.dtype} of shape {found.shape}",
+            )
+    if columns.terminations.dtype != np.bool_ and not np.isin(columns.terminations, (0, 1)).all():
+        raise InvalidDataError(
+            f"{where}: terminations", expected="booleans", actual=f"values such as {columns.terminations.max()}"
+        )

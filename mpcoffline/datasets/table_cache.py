@@ -1,0 +1,260 @@
+"""Packed tables in files: written block by block, found again by the content they were built from.
+
+The key of a table is the SHA-256 of the data set's file: not its name, since a copy is the same, and not
+its size and date alone, since a file can be changed and keep both. Hashing takes about a second a gigabyte, so
+the hash is remembered for as long as inode, size, and the times of modification and of status change (which nobody
+sets) are the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import weakref
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.errors import FileFormatError, StorageError
+
+from .atomic import publish
+from .manifest import sha256_of
+
+VERSION = 1
+READ_BYTES = 1 << 18
+_ROWS, _IDS, _META = "rows.f32", "episodes.i64", "table.json"
+
+
+class TableFile:
+    """A table in a folder: packed rows, episode ids, and the CRC-32 of each block of rows.
+
+    Args:
+        folder: The folder, as :func:`write_table` leaves it. It may be removed afterwards: the files stay open.
+
+    Attributes:
+        ny: Number of observation coordinates.
+        nu: Number of action coordinates.
+        rows: The rows ``(n, 2 ny + nu + 2)``, mapped.
+        episode_ids: The episode of each row ``(n,)``, mapped.
+        block_rows: Number of rows in a block.
+
+    Raises:
+        FileFormatError: For a folder that is not such a table, of another version, or with files of another size.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            meta = json.loads((folder / _META).read_text(encoding="utf-8"))
+            if meta["version"] != VERSION:
+                raise ValueError(f"version {meta['version']}")
+            self.ny, self.nu, n = int(meta["ny"]), int(meta["nu"]), int(meta["rows"])
+            self.block_rows, self._crcs = int(meta["block_rows"]), [int(crc) for crc in meta["crcs"]]
+            self._ids_crc = int(meta["ids_crc"])
+            self._fd = os.open(folder / _ROWS, os.O_RDONLY | os.O_CLOEXEC)
+            weakref.finalize(self, os.close, self._fd)
+            shape = (n, 2 * self.ny + self.nu + 2)
+            self.row_bytes = 4 * shape[1]
+            sizes = (os.fstat(self._fd).st_size, (folder / _IDS).stat().st_size)
+            if sizes != (n * self.row_bytes, 8 * n) or len(self._crcs) != -(-n // self.block_rows):
+                raise ValueError(f"files of {sizes} bytes for {n} rows")
+            self.rows: NDArray[np.float32] = np.memmap(folder / _ROWS, np.float32, "r", shape=shape)
+            self.episode_ids: NDArray[np.int64] = np.memmap(folder / _IDS, np.int64, "r", shape=(n,))
+        except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
+            raise self._damaged(f"{type(error).__name__}: {error}") from error
+        self._checked = np.zeros(len(self._crcs), dtype=bool)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks, the last of which may be shorter."""
+        return len(self._crcs)
+
+    def load(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Reads rows and episode ids into memory and checks them.
+
+        Raises:
+            FileFormatError: Where they are not what was written.
+        """
+        rows, ids = np.empty(self.rows.shape, np.float32), np.array(self.episode_ids)
+        for block in range(self.n_blocks):
+            start = block * self.block_rows
+            self.read_block(block, rows[start : start + self.block_rows])
+        if zlib.crc32(ids.data) != self._ids_crc:
+            raise self._damaged("episode ids with another CRC-32")
+        return rows, ids
+
+    def read_block(self, block: int, out: NDArray[np.float32]) -> int:
+        """Reads a block into the first rows of ``out`` and checks it the first time; returns its number of rows.
+
+        Raises:
+            FileFormatError: Where it is not what was written.
+        """
+        count = min(self.block_rows, len(self.rows) - block * self.block_rows)
+        view = _bytes(out[:count])
+        offset, done = block * self.block_rows * self.row_bytes, 0
+        while done < len(view):
+            got = os.preadv(self._fd, [view[done:]], offset + done)
+            if got == 0:
+                raise self._damaged(f"an end at byte {offset + done}")
+            done += got
+        if not self._checked[block]:
+            if zlib.crc32(view) != self._crcs[block]:
+                raise self._damaged(f"block {block} with another CRC-32")
+            self._checked[block] = True
+        return count
+
+    def advise(self, block: int, *, needed: bool) -> None:
+        """Tells the system to fetch a block in the background, or that its copy in the page cache is not needed."""
+        if hasattr(os, "posix_fadvise"):
+            size = self.block_rows * self.row_bytes
+            advice = os.POSIX_FADV_WILLNEED if needed else os.POSIX_FADV_DONTNEED
+            os.posix_fadvise(self._fd, block * size, size, advice)
+
+    def _damaged(self, found: str) -> FileFormatError:
+        return FileFormatError(
+            f"table {self.folder}", expected="an intact packed table", actual=found, hint="Remove that folder."
+        )
+
+
+def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> None:
+    """Writes a table into an empty folder.
+
+    Args:
+        folder: The folder.
+        ny: Number of observation coordinates.
+        nu: Number of action coordinates.
+        blocks: Packed rows ``(B, 2 ny + nu + 2)`` and their episodes ``(B,)``.
+
+    Raises:
+        StorageError: Where the disk refuses.
+    """
+    row_bytes = 4 * (2 * ny + nu + 2)
+    block_bytes = max(1, READ_BYTES // row_bytes) * row_bytes
+    crcs: list[int] = []
+    crc, room, total, ids_crc = 0, block_bytes, 0, 0
+    try:
+        with (folder / _ROWS).open("wb") as rows_file, (folder / _IDS).open("wb") as ids_file:
+            for rows, ids in blocks:
+                view = _bytes(np.ascontiguousarray(rows, np.float32))
+                rows_file.write(view)
+                total += len(view)
+                while len(view):
+                    part, view = view[:room], view[room:]
+                    crc, room = zlib.crc32(part, crc), room - len(part)
+                    if room == 0:
+                        crcs.append(crc)
+                        crc, room = 0, block_bytes
+                ids_view = _bytes(np.ascontiguousarray(ids, np.int64))
+                ids_file.write(ids_view)
+                ids_crc = zlib.crc32(ids_view, ids_crc)
+        if room < block_bytes:
+            crcs.append(crc)
+        meta = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
+        meta |= {"block_rows": block_bytes // row_bytes, "ids_crc": ids_crc}
+        (folder / _META).write_text(json.dumps({**meta, "crcs": crcs}), encoding="utf-8")
+    except OSError as error:
+        raise StorageError.of(folder, error) from error
+
+
+def cached_table(
+    key: str, ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path
+) -> TableFile:
+    """The table of that key, written now if the cache does not hold it (intact).
+
+    Raises:
+        StorageError: Where the disk refuses; the cache is as it was.
+    """
+    target = cache / key
+    try:
+        return TableFile(target)
+    except FileFormatError:
+        shutil.rmtree(target, ignore_errors=True)
+    building = _scratch_folder(cache)
+    try:
+        write_table(building, ny, nu, blocks)
+        try:
+            publish(building, target, overwrite=False)
+        except OSError:
+            if not target.exists():  # otherwise another process was faster: its table is as good
+                raise
+        return TableFile(target)
+    except OSError as error:
+        raise error if isinstance(error, StorageError) else StorageError.of(target, error) from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
+def scratch_table(ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path) -> TableFile:
+    """A table in files that have no name any more, so that they vanish with their last user.
+
+    Raises:
+        StorageError: Where the disk refuses.
+    """
+    folder = _scratch_folder(cache)
+    try:
+        write_table(folder, ny, nu, blocks)
+        return TableFile(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def content_key(path: Path, episodes: NDArray[Any] | None, cache: Path) -> str:
+    """The cache key of a data set's file.
+
+    Args:
+        path: The file.
+        episodes: The episodes chosen of it; None for all.
+        cache: Folder in which hashes are remembered.
+
+    Raises:
+        StorageError: Where that folder cannot be written.
+    """
+    stat = path.stat()
+    signature = [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
+    note = cache / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:32]}.json"
+    try:
+        known = json.loads(note.read_text(encoding="utf-8"))
+        digest = str(known["sha256"]) if known["signature"] == signature else None
+    except (OSError, ValueError, KeyError, TypeError):
+        digest = None
+    if digest is None:
+        digest = sha256_of(path)
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            new = note.with_suffix(f".{os.getpid()}")
+            new.write_text(json.dumps({"signature": signature, "sha256": digest}), encoding="utf-8")
+            os.replace(new, note)
+        except OSError as error:
+            raise StorageError.of(cache, error) from error
+    chosen = b"" if episodes is None else np.ascontiguousarray(episodes, np.int64).tobytes()
+    return hashlib.sha256(digest.encode() + chosen).hexdigest()[:40]
+
+
+def default_cache() -> Path:
+    """``mpcoffline/tables`` in the user's cache folder; it can be removed at any time."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mpcoffline" / "tables"
+
+
+def default_memory() -> int:
+    """A quarter of this machine's memory, in bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
+def _bytes(array: Any) -> memoryview:
+    """The memory of a contiguous array."""
+    return memoryview(array.reshape(-1)).cast("B")
+
+
+def _scratch_folder(cache: Path) -> Path:
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix=".building-", dir=cache))
+    except OSError as error:
+        raise StorageError.of(cache, error) from error
