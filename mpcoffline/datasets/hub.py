@@ -26,7 +26,7 @@ from .manifest import MANIFEST, differences, read_manifest, sha256_of, write_man
 from .minari_store import _declare_namespace, check_dataset_id, dataset_path, is_local, load_dataset
 from .recipes import catalog_file
 from .remotes import SETTING, Listing, Remote, RemoteError, fetch, open_remote, remote_errors
-from .verify import open_dataset, verify
+from .verification import open_dataset, verify
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -163,7 +163,7 @@ def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | N
         Where it is now, with the revision and the hash that pin it.
 
     Raises:
-        InvalidDataError: Where :func:`~mpcoffline.datasets.verify.verify` finds something serious.
+        InvalidDataError: Where :func:`~mpcoffline.datasets.verify` finds something serious.
         InvalidArgumentError: Where the remote holds that id already, or none is configured.
         RemoteError: Where it does not answer, or refuses.
     """

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from pendulum_data import PENDULUM, recorded, stored
 from rich.console import Console
 
-from mpcoffline.datasets.replay import recover_environment, replay
+from mpcoffline.datasets.replaying import recover_environment, replay
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 
@@ -36,6 +36,7 @@ def test_what_was_recorded_here_is_repeated_bit_for_bit(env_id: str) -> None:
         assert "bitwise equal (3 episodes, 300 steps)" in str(report)
 
 
+@pytest.mark.slow
 def test_shipped_data_are_repeated() -> None:
     report = replay("mpcoffline/pendulum/ddpg-v0", n_episodes=5)
     assert report.ok

@@ -11,8 +11,9 @@ from matplotlib.image import imread
 from pendulum_data import recorded, stored
 from rich.console import Console
 
+import mpcoffline.datasets as package
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.datasets.show import coverage, show
+from mpcoffline.datasets.summary import coverage, show
 from mpcoffline.errors import InvalidDataError, UnknownIdError
 
 
@@ -44,6 +45,7 @@ def test_the_numbers_are_those_of_the_data(tmp_path: Path) -> None:
     assert show(dataset).figure is None
 
 
+@pytest.mark.slow
 def test_a_shipped_data_set_has_its_card() -> None:
     summary = show("mpcoffline/pendulum/ddpg-v0")
     assert summary.card == catalog_file("pendulum.md").read_text(encoding="utf-8")
@@ -65,3 +67,8 @@ def test_what_has_no_vectors_is_refused() -> None:
         show(dataset)
     with pytest.raises(UnknownIdError):
         show("test/nothing-v0")
+
+
+def test_the_package_gives_every_function() -> None:
+    for name in package.__all__:
+        assert callable(getattr(package, name))

@@ -18,7 +18,7 @@ from pendulum_data import recorded, stored
 from rich.console import Console
 
 from mpcoffline.datasets.manifest import MANIFEST, write_manifest
-from mpcoffline.datasets.verify import verify
+from mpcoffline.datasets.verification import verify
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
 
