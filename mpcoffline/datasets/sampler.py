@@ -30,9 +30,9 @@ def gather_batches(
 
     tensor = torch.from_numpy(rows)
     for _ in itertools.count() if epochs is None else range(epochs):
-        order = torch.from_numpy(rng.permutation(len(rows)))
-        for start in range(0, len(rows) - batch_size + 1, batch_size):
-            yield tensor.index_select(0, order[start : start + batch_size])
+        order = torch.from_numpy(rng.permutation(len(rows))[: len(rows) // batch_size * batch_size])
+        for index in order.split(batch_size):
+            yield tensor.index_select(0, index)
 
 
 def block_batches(
@@ -69,13 +69,14 @@ def block_batches(
             following = blocks[first + capacity : first + 2 * capacity]
             order = torch.from_numpy(rng.permutation(filled))
             batches = filled // batch_size
+            indices = order.split(batch_size)
             advised = 0
             for i in range(batches):
                 ahead = len(following) * (i + 1) // batches
                 for block in following[advised:ahead]:
                     file.advise(block, needed=True)
                 advised = ahead
-                yield tensor.index_select(0, order[i * batch_size : (i + 1) * batch_size])
+                yield tensor.index_select(0, indices[i])
             left = order[batches * batch_size :]
             pool[: len(left)] = tensor.index_select(0, left).numpy()
             filled = len(left)
