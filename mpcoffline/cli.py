@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperGroup
 
+from mpcoffline import cli_datasets
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError, UnknownIdError
 
 if TYPE_CHECKING:
@@ -81,8 +82,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Start with:\n\nmpcoffline run pendulum",
 )
-datasets_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="The data sets on this machine.")
-app.add_typer(datasets_app, name="datasets")
+app.add_typer(cli_datasets.app, name="datasets")
 
 TaskArgument = Annotated[Task, typer.Argument(help="Which task.", show_default=False)]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
@@ -275,17 +275,20 @@ def evaluate(
     console.print(table)
 
 
-@datasets_app.command("list")
-def list_datasets() -> None:
-    """The data sets that can be learned from: shipped with the package, or in the local Minari store."""
-    import mpcoffline
+@app.command(epilog="Example:\n\nmpcoffline export learner_policy.zip --out controller/")
+def export(
+    policy: Annotated[Path, typer.Argument(help="A saved policy or learner (.zip).", exists=True, dir_okay=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the C files.", file_okay=False)] = Path("controller"),
+) -> None:
+    """Write a policy as self-contained C99: no allocation, no dependency, a fixed budget of iterations.
 
-    table = Table(box=None, pad_edge=False)
-    for name in ("id", "where", "episodes", "transitions"):
-        table.add_column(name, justify="right" if name in ("episodes", "transitions") else "left", no_wrap=True)
-    for row in mpcoffline.list_datasets():
-        table.add_row(row.id, row.where, str(row.episodes), str(row.steps))
-    console.print(table)
+    The folder receives the controller, a header with names and units of the parameters, a CMake file, and a test that
+    compares it with this package's solutions.
+    """
+    from mpcoffline.export import export_c
+
+    for path in export_c(_loaded_policy(policy), out):
+        _say_file("C", path)
 
 
 def _say_file(what: str, path: Path) -> None:

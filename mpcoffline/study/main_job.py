@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _LEARNED: dict[str, Learn] = {"MPC_2": "cost", "MPC_3": "cost+model"}
 _LAST_EPISODES = 50
 # Far from the seeds that a data set was recorded with: the starts of the comparison are not among those of the data.
-_FIRST_START = 1_000_000
+FIRST_START = 1_000_000
 
 
 def run_task(
@@ -97,7 +97,7 @@ def run_task(
             setup.env_id,
             setup.env_kwargs,
             starts,
-            seed=_FIRST_START + seed,
+            seed=FIRST_START + seed,
             discount=setup.nominal.discount,
             workers=workers,
             on_progress=on_progress,

@@ -1,0 +1,64 @@
+"""The commands around data sets, and the export of a policy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from mpcoffline.cli import app
+
+SHIPPED = "mpcoffline/linear/ddpg-v0"
+
+
+@pytest.fixture(autouse=True)
+def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    (tmp_path / "minari").mkdir()
+    monkeypatch.delenv("MINARI_REMOTE", raising=False)
+
+
+def run(*arguments: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["datasets", *arguments])
+    return result.exit_code, result.output
+
+
+def test_show_prints_the_card_and_draws_the_coverage(tmp_path: Path) -> None:
+    code, output = run("show", SHIPPED, "--figure", str(tmp_path / "coverage.png"))
+    assert code == 0
+    assert "50000" in output
+    assert (tmp_path / "coverage.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_verify_replay_and_repair_of_intact_data() -> None:
+    assert run("verify", SHIPPED)[0] == 0
+    code, output = run("replay", SHIPPED, "--episodes", "3")
+    assert code == 0
+    assert "3 episodes, 300 steps" in " ".join(output.split())
+    code, output = run("repair", SHIPPED)
+    assert code == 0
+    assert "intact" in output
+
+
+def test_verify_says_what_is_wrong(tmp_path: Path) -> None:
+    run("show", SHIPPED)
+    metadata = tmp_path / "minari" / SHIPPED / "data" / "metadata.json"
+    content = json.loads(metadata.read_text())
+    metadata.write_text(json.dumps(content | {"total_episodes": 499}))
+    code, output = run("verify", SHIPPED)
+    assert code == 1
+    assert "499" in output
+
+
+@pytest.mark.parametrize("command", ["show", "verify", "replay", "repair", "upload"])
+def test_unknown_ids_are_refused(command: str) -> None:
+    code, _ = run(command, "mpcoffline/linear/dpg-v0")
+    assert code == 2
+
+
+def test_downloading_without_a_remote_says_how_to_set_one() -> None:
+    result = CliRunner().invoke(app, ["datasets", "download", "mine/plant/log-v0"])
+    assert result.exit_code == 2
+    assert "MINARI_REMOTE" in result.stderr
