@@ -103,6 +103,7 @@ class Solver(ABC):
 
     def __init__(self, mpc: MPC) -> None:
         self.mpc = mpc
+        self._theta = mpc.theta
 
     def solve(
         self,
@@ -130,14 +131,14 @@ class Solver(ABC):
         """
         states = _checked("x", x, self.mpc.nx)
         imposed = None if u0 is None else self._checked_inputs(u0, len(states))
-        parameters = self.mpc.theta if theta is None else self._checked_theta(theta, len(states))
+        parameters = self._theta if theta is None else self._checked_theta(theta, len(states))
         plan = warm_start.plan if isinstance(warm_start, Solution) else warm_start
         if plan is not None:
-            template = Plan.none(len(states), self.mpc)
-            for name, given, expected in zip(("x", "u"), plan, template, strict=True):
-                if given.shape != expected.shape:
+            n, N = len(states), self.mpc.horizon
+            for name, given, expected in (("x", plan.x, (n, N + 1, self.mpc.nx)), ("u", plan.u, (n, N, self.mpc.nu))):
+                if given.shape != expected:
                     raise InvalidArgumentError(
-                        f"warm_start.{name}", expected=f"shape {expected.shape}", actual=f"shape {given.shape}"
+                        f"warm_start.{name}", expected=f"shape {expected}", actual=f"shape {given.shape}"
                     )
         solution = self._solve(states, parameters, imposed, plan or Plan.none(len(states), self.mpc))
         return solution.unbatched() if np.ndim(x) == 1 else solution
