@@ -21,11 +21,21 @@ def floats(name: str, column: str, values: ArrayLike, ndim: int) -> NDArray[np.f
 
 
 def checked_episode_ids(name: str, values: ArrayLike, length: int) -> NDArray[np.int64]:
-    """The ids as int64 ``(length,)``, or an ``InvalidDataError``."""
+    """The ids as int64 ``(length,)``, or an ``InvalidDataError``, also where an id comes again after another."""
     ids = np.asarray(values)
     if ids.shape != (length,) or not np.issubdtype(ids.dtype, np.integer):
         raise InvalidDataError(
             f"{name}: episode_ids", expected=f"{length} integers", actual=f"{ids.dtype} of shape {ids.shape}"
+        )
+    starts = np.flatnonzero(np.concatenate([[True], ids[1:] != ids[:-1]])) if length else np.empty(0, np.intp)
+    _, first = np.unique(ids[starts], return_index=True)
+    if len(first) != len(starts):
+        again = int(starts[np.setdiff1d(np.arange(len(starts)), first)[0]])
+        raise InvalidDataError(
+            f"{name}, row {again}: episode_ids",
+            expected="the rows of an episode in one piece",
+            actual=f"episode {ids[again]} again",
+            hint="Give each episode a number of its own, and keep its rows together in time order.",
         )
     return ids.astype(np.int64)
 

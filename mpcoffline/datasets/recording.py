@@ -21,6 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageError
 
+from .atomic import sync_folder
 from .episode_log import EpisodeLog, LoggedEpisode, LogHeader, LogIndex, scan
 from .minari_store import check_new_dataset, dataset_path, is_local, recording_of, write_dataset
 
@@ -183,6 +184,10 @@ class Recording:
         if env not in self._logs:
             path = self._lock.folder / f"env-{env:04d}.log"
             self._logs[env] = EpisodeLog(path, self.header, **self._settings)
+            folder = path.parent
+            while folder != dataset_path("").parent:  # its name, and those of new folders above, on the disk too
+                sync_folder(folder)
+                folder = folder.parent
         self._logs[env].append(LoggedEpisode.of(buffer, self._sequence, complete=complete))
         self._sequence += 1
 

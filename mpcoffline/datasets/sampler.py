@@ -31,7 +31,7 @@ def gather_batches(
     tensor = torch.from_numpy(rows)
     for _ in itertools.count() if epochs is None else range(epochs):
         order = torch.from_numpy(rng.permutation(len(rows))[: len(rows) // batch_size * batch_size])
-        for index in order.split(batch_size):
+        for index in torch.split(order, batch_size):
             yield tensor.index_select(0, index)
 
 
@@ -69,7 +69,7 @@ def block_batches(
             following = blocks[first + capacity : first + 2 * capacity]
             order = torch.from_numpy(rng.permutation(filled))
             batches = filled // batch_size
-            indices = order.split(batch_size)
+            indices = torch.split(order, batch_size)
             advised = 0
             for i in range(batches):
                 ahead = len(following) * (i + 1) // batches

@@ -263,6 +263,12 @@ def test_from_minari_names_data_set_episode_and_step() -> None:
         TransitionTable.from_minari(dataset)
 
 
+def test_an_episode_in_two_pieces_is_refused() -> None:
+    columns = (np.zeros((4, 1)), np.zeros((4, 1)), np.zeros(4), np.zeros((4, 1)), np.zeros(4))
+    with pytest.raises(InvalidDataError, match=r"transitions, row 3: episode_ids: .*in one piece, got episode 7 again"):
+        TransitionTable.from_arrays(*columns, [7, 7, 2, 7])
+
+
 def test_importing_the_package_stays_light() -> None:
     code = (
         "import sys, mpcoffline, mpcoffline.datasets, mpcoffline.datasets.transitions\n"
