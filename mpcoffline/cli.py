@@ -128,9 +128,6 @@ def run(
     output: Annotated[
         Path | None, typer.Option(help="Folder for table and figure.", show_default="results/TASK", file_okay=False)
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes for the closed loops.", show_default="one a CPU core", min=1)
-    ] = None,
 ) -> None:
     """The main job: learn MPC_2 and MPC_3 from data and compare them with MPC_1.
 
@@ -149,7 +146,6 @@ def run(
         n_episodes=episodes,
         output=folder,
         value=value.value,
-        workers=workers,
     )
     console.print(result.table())
     for note in result.notes():

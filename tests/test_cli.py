@@ -202,6 +202,5 @@ def test_run_hands_its_options_on_and_says_where_the_files_are(monkeypatch: pyte
         "n_episodes": 6,
         "output": Path("results/cartpole"),
         "value": "expectile",
-        "workers": None,
     }
     assert "results/cartpole/figure.png" in plain(result)

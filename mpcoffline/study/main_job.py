@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,12 +10,12 @@ import numpy as np
 
 from mpcoffline.datasets import TransitionTable, load_dataset
 from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.evaluation import Evaluation, evaluate
 from mpcoffline.learner import Learn, OfflineMPCLearner
 from mpcoffline.mpc import MPC
 from mpcoffline.plotting import save_figure
-from mpcoffline.policy import MPCPolicy
+from mpcoffline.policy import MPCPolicy, SolverStats
 
-from .closed_loop import ClosedLoop, evaluate_all
 from .figure import main_job_figure
 from .results import REFERENCE, ControllerResult, TaskResult
 from .setups import Setup, setup_of
@@ -41,7 +39,6 @@ def run_task(
     n_episodes: int = 24,
     output: str | Path,
     value: str | None = None,
-    workers: int | None = None,
     progress: bool = True,
     **learner_options: Any,
 ) -> TaskResult:
@@ -63,7 +60,6 @@ def run_task(
         n_episodes: Closed-loop episodes of each controller.
         output: Folder for table and figure.
         value: ``"residual"`` (the published one, default), ``"td"`` or ``"expectile"``.
-        workers: Processes for the closed loops; one a CPU core by default.
         progress: Whether to draw progress bars.
         **learner_options: Further arguments of :class:`~mpcoffline.OfflineMPCLearner`, e.g. ``prior=1e-2``.
 
@@ -91,20 +87,23 @@ def run_task(
     for name, (learner, _) in learners.items():
         learner.save(folder / f"{name}_learner.zip")
     starts = setup.starts(n_episodes)
-    with _progress_bar("Closed loops", progress) as on_progress:
-        loops = evaluate_all(
-            _saved(mpcs, setup, folder),
-            setup.env_id,
-            setup.env_kwargs,
-            starts,
-            seed=FIRST_START + seed,
+    policies = _policies(mpcs, setup)
+    for name, policy in policies.items():
+        policy.save(folder / f"{name}.zip")
+    loops = {
+        name: evaluate(
+            policy,
+            setup.make_env(),
+            n_episodes,
+            FIRST_START + seed,
             discount=setup.nominal.discount,
-            workers=workers,
-            on_progress=on_progress,
+            options=[{"start": start} for start in starts],
         )
+        for name, policy in policies.items()
+    }
 
     # The trajectories that are kept for the figure: those from the start that costs the reference most.
-    example = int(np.argmax(loops[REFERENCE].evaluation.cost))
+    example = int(np.argmax(loops[REFERENCE].cost))
     descriptions = {
         "MPC_1": "nominal cost, " + ("nominal model" if setup.env_kwargs else "model with parameter errors"),
         "MPC_2": "cost learned, model as in MPC_1",
@@ -125,7 +124,8 @@ def run_task(
         example=example,
         theta={name: {key: array.tolist() for key, array in mpc.values.items()} for name, mpc in mpcs.items()},
         controllers=[
-            _controller_result(name, descriptions[name], loop, times.get(name), example) for name, loop in loops.items()
+            _controller_result(name, descriptions[name], loop, policies[name].solver_stats, times.get(name), example)
+            for name, loop in loops.items()
         ],
         behaviour=_behaviour(TransitionTable.from_minari(data), setup.nominal.discount),
     )
@@ -149,34 +149,31 @@ def _learn(
     return learners
 
 
-def _saved(mpcs: dict[str, MPC], setup: Setup, folder: Path) -> dict[str, Path]:
-    """The policies as files, which is how they reach the processes that run them."""
+def _policies(mpcs: dict[str, MPC], setup: Setup) -> dict[str, MPCPolicy]:
+    """The controllers as policies of the task's environment."""
     env = setup.make_env()
     observation_space, action_space = (cast("spaces.Box", space) for space in (env.observation_space, env.action_space))
-    paths = {}
-    for name, mpc in mpcs.items():
-        policy = MPCPolicy(mpc, observation_space=observation_space, action_space=action_space)
-        paths[name] = folder / f"{name}.zip"
-        policy.save(paths[name])
-    return paths
+    return {
+        name: MPCPolicy(mpc, observation_space=observation_space, action_space=action_space)
+        for name, mpc in mpcs.items()
+    }
 
 
 def _controller_result(
-    name: str, description: str, loop: ClosedLoop, fit_time: float | None, example: int
+    name: str, description: str, loop: Evaluation, stats: SolverStats, fit_time: float | None, example: int
 ) -> ControllerResult:
-    evaluation, stats = loop.evaluation, loop.solver_stats
     return ControllerResult(
         name=name,
         description=description,
-        costs=evaluation.cost.tolist(),
-        discounted_costs=evaluation.discounted_cost.tolist(),
-        successes=evaluation.success.tolist(),
+        costs=loop.cost.tolist(),
+        discounted_costs=loop.discounted_cost.tolist(),
+        successes=loop.success.tolist(),
         fit_time=fit_time,
         solve_time=stats.time / stats.n_solves,
         n_solves=stats.n_solves,
         n_failures=stats.n_failures,
-        states=evaluation.states[example].tolist(),
-        actions=evaluation.actions[example].tolist(),
+        states=loop.states[example].tolist(),
+        actions=loop.actions[example].tolist(),
     )
 
 
@@ -191,13 +188,3 @@ def _behaviour(table: TransitionTable, discount: float) -> ControllerResult:
         discounted_costs=[float(discount ** np.arange(len(costs)) @ costs) for costs in episodes],
         successes=None,
     )
-
-
-@contextmanager
-def _progress_bar(title: str, show: bool) -> Iterator[Callable[[int, int], Any]]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, disable=not show) as bar:
-        task = bar.add_task(f"{title} (episodes)", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
