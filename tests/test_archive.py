@@ -266,6 +266,7 @@ ANYTHING = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=250)
 @given(data=st.data(), kind=st.sampled_from(["learner", "policy"]))
 def test_wrong_values_in_a_valid_zip(folder: Path, data: st.DataObject, kind: str) -> None:

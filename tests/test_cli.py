@@ -72,6 +72,7 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.slow
 def test_the_installed_command_shows_errors_without_traceback() -> None:
     command = [str(Path(sys.executable).parent / "mpcoffline"), "run", "pendulum", "--dataset", "mpcoffline/nope-v0"]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -25,6 +25,7 @@ def run(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.slow
 def test_show_prints_the_card_and_draws_the_coverage(tmp_path: Path) -> None:
     code, output = run("show", SHIPPED, "--figure", str(tmp_path / "coverage.png"))
     assert code == 0
@@ -32,6 +33,7 @@ def test_show_prints_the_card_and_draws_the_coverage(tmp_path: Path) -> None:
     assert (tmp_path / "coverage.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_verify_replay_and_repair_of_intact_data() -> None:
     assert run("verify", SHIPPED)[0] == 0
     code, output = run("replay", SHIPPED, "--episodes", "3")
@@ -42,6 +44,7 @@ def test_verify_replay_and_repair_of_intact_data() -> None:
     assert "intact" in output
 
 
+@pytest.mark.slow
 def test_verify_says_what_is_wrong(tmp_path: Path) -> None:
     run("show", SHIPPED)
     metadata = tmp_path / "minari" / SHIPPED / "data" / "metadata.json"

@@ -125,6 +125,7 @@ def test_table_id_and_dataset_give_the_same_bits() -> None:
     assert isinstance(learners[0].policy.observation_space, spaces.Box)
 
 
+@pytest.mark.slow
 def test_shipped_data_are_known_by_id() -> None:
     learner = quick(nominal_mpc("mpcoffline/PendulumSwingUp-v0", 0.5, 0), learn="cost")
     learner.fit("mpcoffline/pendulum/ddpg-v0", show_progress=False)
@@ -180,6 +181,7 @@ def test_theta_is_the_callers_own_copy() -> None:
     assert (learner.theta != 0.0).any()
 
 
+@pytest.mark.slow
 def test_the_history_counts_epochs_of_both_regressions() -> None:
     learner = fitted(value_n_steps=600, fit_n_steps=150)
     epochs, metrics = zip(*learner.history, strict=True)

@@ -52,6 +52,7 @@ def test_what_is_collected_is_raw(task: str) -> None:
     assert (env.spec.id, env.spec.max_episode_steps, env.spec.kwargs) == (recipe.env_id, 100, recipe.env_kwargs)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_data() -> None:
     recipes = [replace(quick("pendulum"), seed=seed, dataset_id=f"test/s{i}-v0") for i, seed in enumerate((3, 3, 4))]
     sets = [collect_with(recipe, progress=False)[0] for recipe in recipes]
@@ -160,6 +161,7 @@ def test_scores_are_those_of_the_environment() -> None:
         assert score.success == np.mean(success)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_a_card_says_what_the_data_are(task: str, tmp_path: Path) -> None:
     recipe = quick(task)
@@ -188,6 +190,7 @@ def test_figures_hold_the_numbers() -> None:
     assert [int(count.sum()) for count in counts] == [1000, 1000]
 
 
+@pytest.mark.slow
 def test_one_call_makes_all_that_is_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = quick("pendulum")
     monkeypatch.setattr(Recipe, "load", lambda task: recipe)

@@ -220,6 +220,7 @@ def record_for_ever(recorded: Any) -> None:
         recorded.append(0, episode(number), complete=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_while_recording(small_disk: Path) -> None:
     recorded = recording()
     with pytest.raises(StorageError, match=r"env-0000.log: expected to be written.*No space left.*Free some space"):

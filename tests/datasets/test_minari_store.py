@@ -69,6 +69,7 @@ def stored(dataset_id: str = "test/set-v0", **arguments: Any) -> minari.MinariDa
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dataset_id", SHIPPED)
 def test_shipped_data_are_500_episodes_that_the_environment_repeats(dataset_id: str) -> None:
     load_dataset(dataset_id)
@@ -130,6 +131,7 @@ def test_a_shipped_file_that_is_not_the_one_shipped_is_refused(
     assert not [path for path in store.rglob("*") if path.is_file()]
 
 
+@pytest.mark.slow
 def test_two_that_materialise_at_once_both_get_it(store: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
         sets = list(pool.map(load_dataset, ["mpcoffline/pendulum/ddpg-v0"] * 2))
@@ -137,6 +139,7 @@ def test_two_that_materialise_at_once_both_get_it(store: Path) -> None:
     assert not list(store.glob(".*"))
 
 
+@pytest.mark.slow
 def test_listing_says_where_data_sets_are() -> None:
     rows = {row.id: row for row in list_datasets()}
     assert sorted(rows) == SHIPPED

@@ -50,6 +50,7 @@ def learned_from_diverse_actions(method: str, tau: float = 0.3) -> Array:
     return fit_value(lq_plant.exploring_log(8_000), lq_plant.DISCOUNT, config, seed=0).predict(GRID)
 
 
+@pytest.mark.slow
 def test_a_low_expectile_lies_below_the_behaviours_value_and_near_the_optimum() -> None:
     optimal = lq_plant.quadratic(lq_plant.BEST.P, GRID)
     td = learned_from_diverse_actions("td")
@@ -59,6 +60,7 @@ def test_a_low_expectile_lies_below_the_behaviours_value_and_near_the_optimum() 
     assert np.abs(low - optimal).mean() < 0.2 * np.abs(td - optimal).mean()
 
 
+@pytest.mark.slow
 def test_expectiles_fall_with_tau() -> None:
     means = [learned_from_diverse_actions("expectile", tau).mean() for tau in (0.03, 0.2, 0.5)]
     assert means == sorted(means)

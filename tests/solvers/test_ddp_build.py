@@ -163,6 +163,7 @@ def child(tmp_path: Path, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_processes_that_build_at_once(cache: Path, tmp_path: Path) -> None:
     children = [child(tmp_path) for _ in range(3)]
     values = {process.communicate()[0] for process in children}

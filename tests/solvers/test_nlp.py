@@ -104,6 +104,7 @@ def test_the_nominal_cost_would_not_do() -> None:
 # ---------------------------------------------------------------- properties of V and Q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "horizon"), [(LINEAR, 10), (PENDULUM, 10), (CARTPOLE, 5)])
 def test_q_value_is_at_least_the_value(env_id: str, horizon: int) -> None:
     """Q_th(s, a) >= V_th(s), with equality at the solution. ipopt's relative tolerance 1e-8, times the value's size."""
@@ -231,6 +232,7 @@ def test_state_constraints_on_a_nonlinear_task() -> None:
     assert after.value > before.value
 
 
+@pytest.mark.slow
 def test_infeasible_problems_are_reported_not_raised() -> None:
     solver = IpoptSolver(integrator(constraints=rate_limit))
     x = np.array([[2.0], [1.0]])

@@ -21,6 +21,7 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
 
 
+@pytest.mark.slow
 def test_brief_run_writes_everything(tmp_path: Path) -> None:
     output = tmp_path / "new" / "folder"
     result = run_task("pendulum", n_episodes=3, output=output, **BRIEF)
@@ -71,7 +72,8 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_linear_task_mpc_3_is_near_optimal(tmp_path: Path) -> None:
-    result = run_task("linear", n_episodes=24, output=tmp_path, progress=False)
+    schedule = {"value_n_steps": 2_000, "fit_n_steps": 500}
+    result = run_task("linear", n_episodes=24, output=tmp_path, progress=False, **schedule)
     assert result.relative_performance("MPC_3")[1] >= 0.995
     assert result.relative_performance("MPC_1")[1] < 0.99
     assert result.controller("MPC_3").success == 1.0
