@@ -8,13 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import h5py
 import minari
 import numpy as np
 import pytest
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
+from pendulum_data import recorded, stored
 
 from mpcoffline.datasets import TransitionTable, list_datasets, load_dataset, minari_store
 from mpcoffline.datasets.minari_store import shipped_datasets, write_dataset
@@ -24,49 +24,6 @@ from mpcoffline.envs import ControlTask
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, InvalidDataError, UnknownIdError
 
 SHIPPED = ["mpcoffline/cartpole/ddpg-v0", "mpcoffline/linear/ddpg-v0", "mpcoffline/pendulum/ddpg-v0"]
-PENDULUM = "mpcoffline/PendulumSwingUp-v0"
-
-
-def recorded(length: int = 5, episodes: int = 2, seed: int = 0) -> list[EpisodeBuffer]:
-    """Short episodes of the pendulum under random torques, made without the recorder."""
-    env = gym.make(PENDULUM)
-    env.action_space.seed(seed)
-    buffers = []
-    for i in range(episodes):
-        observation, info = env.reset(seed=seed + i)
-        columns: dict[str, Any] = {"observations": [observation], "actions": [], "rewards": []}
-        infos = {"cost": [[0.0]], "state": [info["state"]]}
-        for _ in range(length):
-            action = env.action_space.sample()
-            observation, reward, _, _, info = env.step(action)
-            columns["observations"].append(observation)
-            columns["actions"].append(action)
-            columns["rewards"].append(reward)
-            infos["cost"].append([info["cost"]])
-            infos["state"].append(info["state"])
-        columns = {key: np.array(value) for key, value in columns.items()}
-        ends = np.arange(length) == length - 1
-        buffers.append(
-            EpisodeBuffer(
-                **columns,
-                terminations=np.zeros(length, bool),
-                truncations=ends,
-                infos={key: np.array(value) for key, value in infos.items()},
-            )
-        )
-    return buffers
-
-
-def stored(dataset_id: str = "test/set-v0", **arguments: Any) -> minari.MinariDataset:
-    env = gym.make(PENDULUM)
-    return write_dataset(
-        dataset_id,
-        arguments.pop("episodes", None) or recorded(),
-        env_spec=env.spec,
-        observation_space=env.observation_space,
-        action_space=env.action_space,
-        **arguments,
-    )
 
 
 @pytest.mark.slow
