@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from mpcoffline.datasets.transitions import Columns, TransitionTable
+from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.torch_twin import TorchTwin
 
+from .bellman import BellmanFit, PredictionError
 from .checks import check_integers, check_number
-from .progress import Report, silent
+from .coordinates import Coordinates, canonical
+from .potential import Potential
+from .progress import Metrics, Report, silent
+from .refit import refit_cost
 from .value import ValueFunction, cosine
 
 Array = NDArray[np.float64]
 
-_OFF_SADDLE = 0.1  # in scaled coordinates
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -29,30 +31,40 @@ class FitConfig:
     """How theta is learned.
 
     Attributes:
-        prior: l2, the weight of |z - z_0|^2, where z are the scaled coordinates of :class:`Coordinates` and the
-            regression error is measured in units of the cost's variance.
-        n_steps: Gradient steps on cost and model together (none where the model is fixed).
+        prior: l2, the weight of |z - z_0|^2, where z are the scaled coordinates of
+            :class:`~mpcoffline.learning.coordinates.Coordinates` and the regression error is measured in units of the
+            cost's variance.
+        prediction_weight: Weight of the one-step prediction error
+            (:class:`~mpcoffline.learning.bellman.PredictionError`) beside (FIT); 0 is the published method.
+        potential: Whether the cost is fitted with a :class:`~mpcoffline.learning.potential.Potential` besides.
+        n_steps: Gradient steps on cost and model together; none where the model is not learned.
         batch_size: Transitions a step.
         learning_rate: Adam's at the start, in scaled coordinates; falls to zero on a cosine.
         clip: Bound on the gradient's norm.
+        n_restarts: How often the gradient steps may begin again, from a perturbed start with half the learning rate,
+            after they ended worse than they began.
         refit_rows: Transitions of the full-batch fit of the cost; a random subset where there are more.
         refit_iterations: Bound on its L-BFGS iterations.
     """
 
     prior: float = 1e-3
+    prediction_weight: float = 0.0
+    potential: bool = False
     n_steps: int = 1_000
     batch_size: int = 512
     learning_rate: float = 0.03
     clip: float = 100.0
+    n_restarts: int = 2
     refit_rows: int = 20_000
     refit_iterations: int = 300
 
     def __post_init__(self) -> None:
-        check_number("prior", self.prior, 0.0, open_low=False)
+        for name in ("prior", "prediction_weight"):
+            check_number(name, getattr(self, name), 0.0, open_low=False)
         for name in ("learning_rate", "clip"):
             check_number(name, getattr(self, name), 0.0)
-        counts = ("n_steps", "batch_size", "refit_rows", "refit_iterations")
-        check_integers(1, **{name: getattr(self, name) for name in counts})
+        check_integers(0, n_steps=self.n_steps, n_restarts=self.n_restarts)
+        check_integers(1, **{n: getattr(self, n) for n in ("batch_size", "refit_rows", "refit_iterations")})
 
 
 @dataclass(frozen=True)
@@ -63,124 +75,169 @@ class FitResult:
         theta: The learned parameters, ``(size,)``.
         loss_before: The regression error of (FIT) at theta_0, in units of the cost's variance.
         loss_after: The same at theta.
+        at_bounds: Names of the learned parameters that ended on a bound.
+        potential: The potential that was fitted with the cost, if one was.
     """
 
     theta: Array
     loss_before: float
     loss_after: float
+    at_bounds: tuple[str, ...] = ()
+    potential: Potential | None = None
 
 
-class Coordinates:
-    """Scaled coordinates z of the learned part of theta, in which a step of one size means the same everywhere.
+class ParameterTraining:
+    """The state of (FIT) between its steps: Adam on cost and model together, then the convex fit of the cost.
 
-    A parameter with a positive lower bound (a mass, a length) is learned by its logarithm; the entries of a row of a
-    matrix factor are measured in the size of that row, other numbers in the size of their block. Bounds on theta
-    become bounds on z. The factor C of a matrix C C' is free here: the sign of a column means nothing, and a diagonal
-    held at zero would block the way to the same matrix with the column reversed; :func:`canonical` restores the signs.
+    The second part, :meth:`finish`, minimises the same objective over the cost alone, where it is a linear
+    least-squares problem in the weights; it takes the minimum that stochastic gradients only approach. Where the model
+    is not learned, it is all.
 
     Args:
-        mpc: The MPC; its parameters are theta_0, and z = 0 there.
-        groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
+        mpc: The MPC; its parameters are theta_0.
+        value: V_phi.
+        table: The transitions.
+        groups: ``("cost",)`` for MPC_2, ``("cost", "model")`` for MPC_3.
+        config: Prior and schedules.
+        seed: Seeds the minibatches.
+
+    Raises:
+        InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
     """
 
-    def __init__(self, mpc: MPC, groups: tuple[str, ...]) -> None:
-        space = mpc.space
-        self.mask = space.mask(groups)
-        theta, low, high = (v[self.mask] for v in (space.theta, space.low, space.high))
-        factor = np.concatenate([np.full(block.size, block.kind == "psd") for block in space])[self.mask]
-        self._stuck = factor & (low == 0.0) & (theta == 0.0)
-        low = np.where(factor, -np.inf, low)
-        self.logarithmic = (low > 0.0) & (theta > 0.0)
-        scale = np.concatenate([_block_scale(block.theta, block.kind) for block in space])[self.mask]
-        self.scale = np.where(self.logarithmic, 1.0, scale)
-        self._theta_0 = theta
-        self._full = space.theta
-        with np.errstate(divide="ignore", invalid="ignore"):
-            self.low, self.high = (
-                np.where(self.logarithmic, np.log(bound / theta), (bound - theta) / self.scale) for bound in (low, high)
+    def __init__(
+        self,
+        mpc: MPC,
+        value: ValueFunction,
+        table: TransitionTable,
+        groups: tuple[str, ...],
+        config: FitConfig,
+        *,
+        seed: int,
+    ) -> None:
+        self._mpc, self._table, self.config = mpc, table, config
+        self._rng = np.random.default_rng(seed)
+        self._problem = BellmanFit(mpc, value, float(table.costs.var(dtype=np.float64)) or 1.0)
+        rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
+        self._sample = table.columns(torch.from_numpy(table.rows[rows]))
+        self._prediction_error = PredictionError(self._problem, self._sample)
+        self._coordinates = Coordinates(mpc, groups)
+        with torch.no_grad():
+            self._loss_before = float(self._problem.error(self._sample, torch.from_numpy(mpc.theta)))
+        if not np.isfinite(self._loss_before):
+            raise InvalidArgumentError(
+                "mpc",
+                expected="a model and a cost that are finite on the data",
+                actual=f"a regression error of {self._loss_before}",
+                hint="Evaluate mpc.dynamics_function and mpc.stage_function at the logged states and actions.",
             )
+        self._low, self._high = (torch.from_numpy(b) for b in (self._coordinates.low, self._coordinates.high))
+        self._batches = table.batches(config.batch_size, self._rng)
+        self.n_steps = config.n_steps if "model" in groups else 0
+        self.attempt = self.step = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """The start of an attempt: the first from theta_0, others a little beside it and with shorter steps."""
+        start = self._coordinates.start
+        if self.attempt:
+            start = start + 0.1 * np.random.default_rng(self.attempt).normal(size=start.shape)
+        z = torch.from_numpy(start)
+        self._z = torch.minimum(torch.maximum(z, self._low), self._high).requires_grad_()
+        self._optimiser = torch.optim.Adam([self._z], lr=self.config.learning_rate)
 
     @property
-    def size(self) -> int:
-        """Number of learned coordinates."""
-        return int(self.mask.sum())
+    def done(self) -> bool:
+        """Whether all gradient steps are made."""
+        return self.step >= self.n_steps
 
-    @property
-    def start(self) -> Array:
-        """Where a descent begins, ``(size,)``: z = 0, but for the zeros on the diagonal of a factor C.
+    def advance(self, n: int) -> Metrics:
+        """Makes n more gradient steps, fewer at the end of an attempt; returns their mean regression error."""
+        losses: list[float] = []
+        for _ in range(min(n, self.n_steps - self.step)):
+            self.step += 1
+            losses += self._gradient_step()
+        if self.done and self._failed() and self.attempt < self.config.n_restarts:
+            self.attempt, self.step = self.attempt + 1, 0
+            _log.warning(
+                "(FIT) ended worse than it began; starting again beside theta_0 (%d of at most %d restarts)",
+                self.attempt,
+                self.config.n_restarts,
+            )
+            self._begin()
+        return {"fit_loss": float(np.mean(losses)) if losses else np.nan}
 
-        With a zero column C is a saddle of any loss in C C', which a descent would never leave.
-        """
-        return np.where(self._stuck, _OFF_SADDLE, 0.0)
+    def _gradient_step(self) -> list[float]:
+        """One step of Adam, projected onto the bounds; returns the regression error where it was finite."""
+        config = self.config
+        schedule = cosine(self.step, self.n_steps) * 0.5**self.attempt
+        self._optimiser.param_groups[0]["lr"] = config.learning_rate * schedule
+        batch, theta = self._table.columns(next(self._batches)), self._coordinates.theta(self._z)
+        error = self._problem.error(batch, theta)
+        loss = error + config.prior * self._z.square().sum()
+        if config.prediction_weight > 0.0:
+            loss = loss + config.prediction_weight * self._prediction_error(batch, theta)
+        self._optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_([self._z], config.clip)
+        if not torch.isfinite(norm):  # one NaN would stay in Adam's moments for ever
+            return []
+        self._optimiser.step()
+        with torch.no_grad():
+            self._z.clamp_(self._low, self._high)
+        return [float(error.detach())]
 
-    def theta(self, z: Tensor) -> Tensor:
-        """The full theta ``(size,)`` of z, differentiable in z."""
-        theta_0, scale = torch.from_numpy(self._theta_0), torch.from_numpy(self.scale)
-        logarithmic = torch.from_numpy(self.logarithmic)
-        # The exponent is masked too: exp of a large linear coordinate would turn its unused gradient into NaN.
-        grown = theta_0 * torch.exp(torch.where(logarithmic, z, 0.0))
-        learned = torch.where(logarithmic, grown, theta_0 + scale * z)
-        return torch.from_numpy(self._full).masked_scatter(torch.from_numpy(self.mask), learned)
+    def _failed(self) -> bool:
+        """Whether the gradient steps ended with a larger objective than they began with."""
+        with torch.no_grad():
+            before, after = (
+                self._objective(self._coordinates.theta(z)) for z in (torch.zeros_like(self._z), self._z.detach())
+            )
+        return not after <= before * (1.0 + 1e-3) + self.config.prior * float(self._z.detach().square().sum())
 
+    def _objective(self, theta: torch.Tensor) -> float:
+        error = self._problem.error(self._sample, theta)
+        return float(error + self.config.prediction_weight * self._prediction_error(self._sample, theta))
 
-def _block_scale(theta: Array, kind: str) -> Array:
-    """The size of each coordinate of a block: its row's for a matrix factor, otherwise the block's largest entry."""
-    if kind != "psd":
-        return np.full(len(theta), float(np.abs(theta).max(initial=0.0)) or 1.0)
-    n = round((np.sqrt(8 * len(theta) + 1) - 1) / 2)
-    rows, columns = np.tril_indices(n)
-    factor = np.zeros((n, n))
-    factor[rows, columns] = theta
-    sizes = np.linalg.norm(factor, axis=1)
-    largest = sizes.max() or 1.0
-    return np.asarray(np.maximum(sizes, 0.1 * largest)[rows])
+    def finish(self) -> FitResult:
+        """The convex fit of the cost from where the gradient steps ended; theta_0's model where they all failed."""
+        theta = self._mpc.theta
+        if self.n_steps and not self._failed():
+            theta = canonical(self._mpc, self._coordinates.theta(self._z.detach()).numpy())
+        elif self.n_steps:
+            _log.warning("(FIT) of cost and model failed in every attempt; the model stays as it was")
+        config = self.config
+        refit = refit_cost(
+            self._mpc,
+            theta,
+            self._problem,
+            self._sample,
+            prior=config.prior,
+            shaped=config.potential,
+            max_iterations=config.refit_iterations,
+        )
+        at_bounds = tuple(self._coordinates.at_bounds(refit.theta))
+        if at_bounds:
+            _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", ", ".join(at_bounds))
+        return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
 
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """What :meth:`restore` needs to go on bit for bit."""
+        arrays = {"z": self._z.detach().numpy().copy(), "steps": np.array([self.attempt, self.step], dtype=np.float64)}
+        moments = self._optimiser.state[self._z]
+        return arrays | {name: moments[name].numpy().copy() for name in ("exp_avg", "exp_avg_sq") if moments}
 
-class BellmanFit:
-    """The regression error of (FIT), as torch expression.
-
-    ::
-
-        E_D[ (L(s,a) + gamma V(s+) - gamma V(f_th(s,a)) - Lhat_th(s,a))^2 ] / Var_D[L]
-
-    After a terminal state both V vanish.
-
-    Args:
-        mpc: The MPC whose functions f and Lhat are fitted.
-        value: V_phi, constant here.
-        unit: The variance that the error is divided by.
-    """
-
-    def __init__(self, mpc: MPC, value: ValueFunction, unit: float) -> None:
-        self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
-        self._value, self._discount, self._unit = value, mpc.discount, unit
-
-    def target(self, batch: Columns) -> Tensor:
-        """L(s,a) + gamma V(s+), ``(B,)``: what does not depend on theta."""
-        alive = 1.0 - batch.terminations.double()
-        target: Tensor = batch.costs.double() + self._discount * alive * self._value(batch.next_observations).double()
-        return target
-
-    def predicted_value(self, batch: Columns, theta: Tensor) -> Tensor:
-        """The discounted value of the predicted successor, gamma V(f_th(s,a)), ``(B,)``."""
-        reached = self._f(batch.observations.double(), batch.actions.double(), theta)
-        alive = 1.0 - batch.terminations.double()
-        value: Tensor = self._discount * alive * self._value(reached.float()).double()
-        return value
-
-    def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:
-        """Lhat_th(s,a), ``(B,)``."""
-        cost: Tensor = self._stage(batch.observations.double(), batch.actions.double(), theta)
-        return cost.squeeze(-1)
-
-    def error(self, batch: Columns, theta: Tensor) -> Tensor:
-        """The mean squared error over a minibatch, a scalar."""
-        explained = self.predicted_value(batch, theta) + self.stage_cost(batch, theta)
-        return self.mean_square(self.target(batch) - explained)
-
-    def mean_square(self, residuals: Tensor) -> Tensor:
-        """The mean square of residuals in units of the cost's variance."""
-        return residuals.square().mean() / self._unit
+    def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
+        """Takes over a state from :meth:`to_arrays` of a training with the same arguments."""
+        self.attempt, self.step = (int(n) for n in arrays["steps"])
+        for _ in range(self.attempt * self.n_steps + self.step):
+            next(self._batches)
+        self._begin()
+        with torch.no_grad():
+            self._z.copy_(torch.from_numpy(arrays["z"]))
+        if "exp_avg" in arrays:
+            moments = {name: torch.from_numpy(arrays[name].copy()) for name in ("exp_avg", "exp_avg_sq")}
+            self._optimiser.state[self._z] = {"step": torch.tensor(float(self.step)), **moments}
 
 
 def fit_parameters(
@@ -194,10 +251,7 @@ def fit_parameters(
     epoch: int = 100,
     report: Report = silent,
 ) -> FitResult:
-    """Learns theta by (FIT): cost and model together by Adam, then the cost by full-batch L-BFGS, model fixed.
-
-    The second step minimises the same objective over the cost alone, where it is a linear least-squares problem in the
-    weights; it takes the minimum that stochastic gradients only approach. Where the model is not learned, it is all.
+    """Learns theta by (FIT): a :class:`ParameterTraining` from beginning to end.
 
     Args:
         mpc: The MPC; its parameters are theta_0.
@@ -215,104 +269,11 @@ def fit_parameters(
     Raises:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
     """
-    rng = np.random.default_rng(seed)
-    unit = float(table.costs.var(dtype=np.float64)) or 1.0
-    problem = BellmanFit(mpc, value, unit)
-    rows = np.sort(rng.permutation(len(table))[: config.refit_rows])
-    sample = table.columns(torch.from_numpy(table.rows[rows]))
-    theta = mpc.theta
-    with torch.no_grad():
-        before = float(problem.error(sample, torch.from_numpy(theta)))
-    if not np.isfinite(before):
-        raise InvalidArgumentError(
-            "mpc",
-            expected="a model and a cost that are finite on the data",
-            actual=f"a regression error of {before}",
-            hint="Evaluate mpc.dynamics_function and mpc.stage_function at the logged states and actions.",
-        )
-    n_steps = config.n_steps if "model" in groups else 0
-    total = n_steps + config.refit_iterations
-    if n_steps:
-        theta = _gradient_steps(mpc, problem, table, groups, config, rng, epoch, total, report)
-    theta, after = _refit_cost(mpc, theta, problem, sample, config)
-    report(total, total, {"fit_loss": after})
-    return FitResult(theta, before, after)
-
-
-def _gradient_steps(
-    mpc: MPC,
-    problem: BellmanFit,
-    table: TransitionTable,
-    groups: tuple[str, ...],
-    config: FitConfig,
-    rng: np.random.Generator,
-    epoch: int,
-    total: int,
-    report: Report,
-) -> Array:
-    """Adam on (FIT) over all learned coordinates, projected onto their bounds after each step."""
-    coordinates = Coordinates(mpc, groups)
-    low, high = torch.from_numpy(coordinates.low), torch.from_numpy(coordinates.high)
-    z = torch.from_numpy(coordinates.start).requires_grad_()
-    optimiser = torch.optim.Adam([z], lr=config.learning_rate)
-    batches = table.batches(config.batch_size, rng)
-    losses: list[float] = []
-    for step in range(1, config.n_steps + 1):
-        optimiser.param_groups[0]["lr"] = config.learning_rate * cosine(step, config.n_steps)
-        error = problem.error(table.columns(next(batches)), coordinates.theta(z))
-        optimiser.zero_grad()
-        (error + config.prior * z.square().sum()).backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_([z], config.clip)
-        if torch.isfinite(norm):  # one NaN would stay in Adam's moments for ever
-            optimiser.step()
-            with torch.no_grad():
-                z.clamp_(low, high)
-            losses.append(float(error.detach()))
-        if step % epoch == 0 or step == config.n_steps:
-            report(step, total, {"fit_loss": float(np.mean(losses)) if losses else np.nan})
-            losses.clear()
-    return canonical(mpc, coordinates.theta(z.detach()).numpy())
-
-
-def _refit_cost(mpc: MPC, theta: Array, problem: BellmanFit, sample: Columns, config: FitConfig) -> tuple[Array, float]:
-    """The cost parameters that minimise (FIT) for a fixed model, by L-BFGS-B; returns theta and the error."""
-    nominal = Coordinates(mpc, ("cost",))
-    start = Coordinates(mpc.with_theta(theta), ("cost",))
-    with torch.no_grad():
-        target = problem.target(sample) - problem.predicted_value(sample, torch.from_numpy(theta))
-    # The prior pulls towards theta_0 also when the gradient steps have left it.
-    offset = torch.from_numpy((theta - mpc.theta)[nominal.mask] / nominal.scale)
-    ratio = torch.from_numpy(start.scale / nominal.scale)
-
-    def objective(point: Array) -> tuple[float, Array]:
-        z = torch.from_numpy(point).requires_grad_()
-        error = problem.mean_square(target - problem.stage_cost(sample, start.theta(z)))
-        loss = error + config.prior * (offset + ratio * z).square().sum()
-        loss.backward()  # type: ignore[no-untyped-call]
-        gradient = z.grad
-        return float(loss.detach()), np.zeros_like(point) if gradient is None else gradient.numpy()
-
-    found = scipy.optimize.minimize(
-        objective,
-        start.start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=list(zip(start.low, start.high, strict=True)),
-        options={"maxiter": config.refit_iterations},
-    )
-    fitted = canonical(mpc, start.theta(torch.from_numpy(found.x)).numpy())
-    with torch.no_grad():
-        error = problem.mean_square(target - problem.stage_cost(sample, torch.from_numpy(fitted)))
-    return fitted, float(error)
-
-
-def canonical(mpc: MPC, theta: Array) -> Array:
-    """The same parameters with matrix factors of non-negative diagonal, and rounding beyond the bounds removed."""
-    result = theta.copy()
-    for block in mpc.space:
-        if block.kind == "psd":
-            rows, columns = np.tril_indices(block.shape[0])
-            part = mpc.space.slices[block.name]
-            signs = np.where(theta[part][rows == columns] < 0.0, -1.0, 1.0)
-            result[part] = theta[part] * signs[columns]
-    return np.clip(result, mpc.space.low, mpc.space.high)
+    training = ParameterTraining(mpc, value, table, groups, config, seed=seed)
+    total = training.n_steps + 1
+    while not training.done:
+        metrics = training.advance(epoch)
+        report(training.step, total, metrics)
+    result = training.finish()
+    report(total, total, {"fit_loss": result.loss_after})
+    return result

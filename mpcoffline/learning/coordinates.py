@@ -1,0 +1,102 @@
+"""Scaled coordinates of theta: what the regressions descend in."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mpcoffline.mpc import MPC
+
+Array = NDArray[np.float64]
+
+_OFF_SADDLE = 0.1  # in scaled coordinates
+_AT_BOUND = 1e-6  # likewise
+
+
+class Coordinates:
+    """Scaled coordinates z of the learned part of theta, in which a step of one size means the same everywhere.
+
+    A parameter with a positive lower bound (a mass, a length) is learned by its logarithm; the entries of a row of a
+    matrix factor are measured in the size of that row, other numbers in the size of their block. Bounds on theta
+    become bounds on z. The factor C of a matrix C C' is free here: the sign of a column means nothing, and a diagonal
+    held at zero would block the way to the same matrix with the column reversed; :func:`canonical` restores the signs.
+
+    Args:
+        mpc: The MPC; its parameters are theta_0, and z = 0 there.
+        groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
+    """
+
+    def __init__(self, mpc: MPC, groups: tuple[str, ...]) -> None:
+        space = mpc.space
+        self.mask = space.mask(groups)
+        theta, low, high = (v[self.mask] for v in (space.theta, space.low, space.high))
+        factor = np.concatenate([np.full(block.size, block.kind == "psd") for block in space])[self.mask]
+        self._stuck = factor & (low == 0.0) & (theta == 0.0)
+        low = np.where(factor, -np.inf, low)
+        self._bounds = np.stack([low, high], axis=1)
+        self._names = [name for name, learned in zip(space.names, self.mask, strict=True) if learned]
+        self.logarithmic = (low > 0.0) & (theta > 0.0)
+        scale = np.concatenate([_block_scale(block.theta, block.kind) for block in space])[self.mask]
+        self.scale = np.where(self.logarithmic, 1.0, scale)
+        self._theta_0 = theta
+        self._full = space.theta
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.low, self.high = (
+                np.where(self.logarithmic, np.log(bound / theta), (bound - theta) / self.scale) for bound in (low, high)
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of learned coordinates."""
+        return int(self.mask.sum())
+
+    @property
+    def start(self) -> Array:
+        """Where a descent begins, ``(size,)``: z = 0, but for the zeros on the diagonal of a factor C.
+
+        With a zero column C is a saddle of any loss in C C', which a descent would never leave.
+        """
+        return np.where(self._stuck, _OFF_SADDLE, 0.0)
+
+    def theta(self, z: Tensor) -> Tensor:
+        """The full theta ``(size,)`` of z, differentiable in z."""
+        theta_0, scale = torch.from_numpy(self._theta_0), torch.from_numpy(self.scale)
+        logarithmic = torch.from_numpy(self.logarithmic)
+        # The exponent is masked too: exp of a large linear coordinate would turn its unused gradient into NaN.
+        grown = theta_0 * torch.exp(torch.where(logarithmic, z, 0.0))
+        learned = torch.where(logarithmic, grown, theta_0 + scale * z)
+        return torch.from_numpy(self._full).masked_scatter(torch.from_numpy(self.mask), learned)
+
+    def at_bounds(self, theta: Array) -> list[str]:
+        """Names of the learned parameters that lie on one of their bounds."""
+        learned = theta[self.mask]
+        bounds = np.nan_to_num(self._bounds, posinf=np.nan, neginf=np.nan)
+        near = np.abs(learned[:, None] - bounds) <= _AT_BOUND * (1.0 + np.abs(bounds))
+        return [name for name, on in zip(self._names, near.any(axis=1), strict=True) if on]
+
+
+def _block_scale(theta: Array, kind: str) -> Array:
+    """The size of each coordinate of a block: its row's for a matrix factor, otherwise the block's largest entry."""
+    if kind != "psd":
+        return np.full(len(theta), float(np.abs(theta).max(initial=0.0)) or 1.0)
+    n = round((np.sqrt(8 * len(theta) + 1) - 1) / 2)
+    rows, columns = np.tril_indices(n)
+    factor = np.zeros((n, n))
+    factor[rows, columns] = theta
+    sizes = np.linalg.norm(factor, axis=1)
+    largest = sizes.max() or 1.0
+    return np.asarray(np.maximum(sizes, 0.1 * largest)[rows])
+
+
+def canonical(mpc: MPC, theta: Array) -> Array:
+    """The same parameters with matrix factors of non-negative diagonal, and rounding beyond the bounds removed."""
+    result = theta.copy()
+    for block in mpc.space:
+        if block.kind == "psd":
+            rows, columns = np.tril_indices(block.shape[0])
+            part = mpc.space.slices[block.name]
+            signs = np.where(theta[part][rows == columns] < 0.0, -1.0, 1.0)
+            result[part] = theta[part] * signs[columns]
+    return np.clip(result, mpc.space.low, mpc.space.high)
