@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,43 +11,26 @@ import numpy as np
 from gymnasium import spaces
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.checkpoint import Checkpoint, History
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
-from mpcoffline.learning import FitConfig, FitResult, ValueConfig, ValueFunction, fit_parameters, fit_value
-from mpcoffline.learning.checks import check_integers, check_number
-from mpcoffline.learning.progress import Metrics, Report
+from mpcoffline.fitting import Epoch, Fit
+from mpcoffline.learning import FitResult, ValueFunction
+from mpcoffline.learning.checks import check_integers
 from mpcoffline.mpc import MPC
 from mpcoffline.policy import MPCPolicy
+from mpcoffline.presets import PRESETS, LearnerConfig
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
 Learn = Literal["cost", "cost+model"]
-History = list[tuple[int, dict[str, float]]]
+#: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
+Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
+#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch.
+Callback = Callable[["OfflineMPCLearner", int, int], None]
 
 _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
-
-
-@dataclass(frozen=True)
-class LearnerConfig:
-    """Everything that a fit depends on besides data and seed.
-
-    Attributes:
-        trim: Share of the transitions that is learned from; the farthest out are left out.
-        value: How V_phi is learned.
-        fit: How theta is learned.
-    """
-
-    trim: float = 0.9
-    value: ValueConfig = field(default_factory=ValueConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
-
-    def __post_init__(self) -> None:
-        check_number("trim", self.trim, 0.0, 1.0)
-
-
-#: The published recipe: (VALUE) by Bellman residual, then (FIT); discount, horizon and terminal cost are the MPC's.
-PRESETS: dict[str, LearnerConfig] = {"paper": LearnerConfig()}
 
 
 class OfflineMPCLearner:
@@ -60,7 +44,7 @@ class OfflineMPCLearner:
 
     By Theorem 1 of Gros & Zanon (doi:10.1109/TAC.2019.2913768) an MPC whose stage cost is Q*(s,a) - gamma V*(f(s,a))
     and whose terminal cost is V* gives the optimal policy even when its model f is wrong; (FIT) looks for that stage
-    cost.
+    cost, and all presets but ``"paper"`` take the terminal cost from V too.
 
     Example:
         >>> mpc = nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0)
@@ -71,13 +55,16 @@ class OfflineMPCLearner:
     Args:
         mpc: MPC_1: the nominal MPC. It is never changed.
         learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3).
-        preset: Name of a :class:`LearnerConfig`; ``"paper"`` is the published recipe.
+        preset: Name of a :class:`~mpcoffline.presets.LearnerConfig` in ``mpcoffline.presets.PRESETS``: ``"paper"`` is
+            the published recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon,
+            ``"best"`` the longest.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
-        value: ``"residual"``, ``"td"`` or ``"expectile"``; overrides the preset.
+        value: Name of a value method, e.g. ``"expectile"``; overrides the preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
         device: Torch device for (VALUE).
-        **overrides: Any field of :class:`LearnerConfig`, :class:`ValueConfig` or :class:`FitConfig`, e.g.
-            ``prior=1e-2`` or ``tau=0.1``; names that both have take a prefix (``value_n_steps``, ``fit_n_steps``).
+        **overrides: Any field of :class:`~mpcoffline.presets.LearnerConfig`, ``ValueConfig`` or ``FitConfig``, e.g.
+            ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; names that two have take a prefix (``value_n_steps``,
+            ``fit_n_steps``).
 
     Raises:
         UnknownIdError: For an unknown preset, value method or override.
@@ -88,7 +75,7 @@ class OfflineMPCLearner:
         self,
         mpc: MPC,
         learn: Learn = "cost+model",
-        preset: str = "paper",
+        preset: str = "default",
         seed: int = 0,
         *,
         value: str | None = None,
@@ -107,19 +94,38 @@ class OfflineMPCLearner:
             raise InvalidArgumentError(
                 "value_function", expected=f"a function of {mpc.nx} coordinates", actual=str(value_function.ny)
             )
-        self.config = _overridden(PRESETS[preset], overrides)
+        self.config = PRESETS[preset].replaced(overrides)
         self.nominal_mpc, self.learn, self.preset, self.seed, self.device = mpc, learn, preset, int(seed), device
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
         self.history: History = []
+        self._mpc: MPC | None = None
         self._observation_space: spaces.Box | None = None
         self._policy: MPCPolicy | None = None
 
-    def fit(self, dataset: MinariDataset | TransitionTable | str, *, show_progress: bool = True) -> History:
+    def fit(
+        self,
+        dataset: MinariDataset | TransitionTable | str,
+        *,
+        n_steps: int | None = None,
+        n_steps_per_epoch: int | None = None,
+        evaluators: Mapping[str, Evaluator] | None = None,
+        callbacks: Sequence[Callback] = (),
+        checkpoint: str | PathLike[str] | None = None,
+        show_progress: bool = True,
+    ) -> History:
         """Learns V_phi, then theta.
 
         Args:
             dataset: A Minari data set, the id of one, or a table of transitions.
+            n_steps: Gradient steps of (VALUE), by far the longest part; the configuration's by default.
+            n_steps_per_epoch: Steps between entries of the history; 500 in (VALUE) and 100 in (FIT) by default.
+            evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
+                one of (FIT) on, when there is a policy.
+            callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch;
+                :mod:`mpcoffline.loggers` has those that write CSV files and TensorBoard events.
+            checkpoint: A file that is written at the end of each epoch. Where it exists, the fit goes on from it and
+                ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
 
         Returns:
@@ -128,50 +134,83 @@ class OfflineMPCLearner:
 
         Raises:
             InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
+            InvalidArgumentError: If the checkpoint is of another fit.
             UnknownIdError: For an unknown data set id.
         """
+        for _ in self.fitter(
+            dataset,
+            n_steps=n_steps,
+            n_steps_per_epoch=n_steps_per_epoch,
+            evaluators=evaluators,
+            callbacks=callbacks,
+            checkpoint=checkpoint,
+            show_progress=show_progress,
+        ):
+            pass
+        return self.history
+
+    def fitter(
+        self,
+        dataset: MinariDataset | TransitionTable | str,
+        *,
+        n_steps: int | None = None,
+        n_steps_per_epoch: int | None = None,
+        evaluators: Mapping[str, Evaluator] | None = None,
+        callbacks: Sequence[Callback] = (),
+        checkpoint: str | PathLike[str] | None = None,
+        show_progress: bool = True,
+    ) -> Iterator[tuple[int, dict[str, float]]]:
+        """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
+        lengths: dict[str, int] = {}
+        if n_steps_per_epoch is not None:
+            check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
+            lengths = {"value_epoch": n_steps_per_epoch, "fit_epoch": n_steps_per_epoch}
+        config = self.config if n_steps is None else self.config.replaced({"value_n_steps": n_steps})
         table, observation_space = self._table(dataset)
-        mpc = self.nominal_mpc
-        table.check_fits(mpc.nx, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
-        table = table.trim(self.config.trim)
-        history: History = []
+        fit = Fit(
+            self.nominal_mpc,
+            _GROUPS[self.learn],
+            config,
+            table,
+            seed=self.seed,
+            device=self.device,
+            value_function=self._given_value_function,
+        )
+        saved = None if checkpoint is None else Checkpoint(checkpoint, fit.identity)
+        history: History = [] if saved is None else saved.resume(fit)
         with _Progress(show_progress) as progress:
-            value_function = self._given_value_function
-            if value_function is None:
-                value_function = fit_value(
-                    table,
-                    mpc.discount,
-                    self.config.value,
-                    seed=self.seed,
-                    device=self.device,
-                    report=progress.phase("(VALUE) learning V", history),
-                ).cpu()
-            result = fit_parameters(
-                mpc,
-                value_function,
-                table,
-                _GROUPS[self.learn],
-                self.config.fit,
-                seed=self.seed,
-                report=progress.phase(f"(FIT) learning {self.learn}", history),
-            )
-        self.value_function, self.result = value_function, result
-        self.history, self._observation_space, self._policy = history, observation_space, None
-        return history
+            for epoch in fit.epochs(**lengths):
+                self.value_function, self.result = fit.value_function, fit.result
+                self._mpc, self._policy, self._observation_space = fit.learned, None, observation_space
+                metrics = dict(epoch.metrics)
+                if fit.learned is not None:
+                    metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
+                history.append((len(history) + 1, metrics))
+                self.history = history
+                for callback in callbacks:
+                    callback(self, len(history), epoch.total_step)
+                if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
+                    saved.write(fit, history)
+                progress.show(epoch)
+                yield history[-1]
 
     @property
     def mpc(self) -> MPC:
-        """The learned MPC; a new object.
+        """The learned MPC; a new object. While fitting, as far as it is learned.
 
         Raises:
             MPCOfflineError: Before ``fit``.
         """
-        return self.nominal_mpc.with_theta(self._fitted().theta)
+        if self._mpc is None:
+            raise MPCOfflineError(
+                "learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset)."
+            )
+        return self._mpc
 
     @property
     def theta(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         """The learned parameters, ``(mpc.space.size,)``."""
-        return self._fitted().theta.copy()
+        return self.mpc.theta
 
     @property
     def policy(self) -> MPCPolicy:
@@ -183,13 +222,6 @@ class OfflineMPCLearner:
         if self._policy is None:
             self._policy = MPCPolicy(self.mpc, observation_space=self._observation_space)
         return self._policy
-
-    def _fitted(self) -> FitResult:
-        if self.result is None:
-            raise MPCOfflineError(
-                "learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset)."
-            )
-        return self.result
 
     def _table(self, dataset: MinariDataset | TransitionTable | str) -> tuple[TransitionTable, spaces.Box | None]:
         if isinstance(dataset, TransitionTable):
@@ -203,18 +235,18 @@ class OfflineMPCLearner:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz."""
+        space = self._observation_space
         document = {
-            "mpc": self.nominal_mpc.to_json(),
+            "nominal": self.nominal_mpc.to_json(),
+            "learned": None if self.result is None else self.mpc.to_json(),
             "learn": self.learn,
             "preset": self.preset,
             "seed": self.seed,
+            "device": self.device,
             "config": asdict(self.config),
             "history": self.history,
-            "result": None
-            if self.result is None
-            else {"theta": self.result.theta.tolist()}
-            | {name: getattr(self.result, name) for name in ("loss_before", "loss_after")},
-            "observation_space": None if self._observation_space is None else box_to_json(self._observation_space),
+            "result": None if self.result is None else self.result.to_json(),
+            "observation_space": None if space is None else box_to_json(space),
         }
         arrays = {} if self.value_function is None else self.value_function.to_arrays()
         write_archive(path, "learner", document, arrays)
@@ -228,15 +260,13 @@ class OfflineMPCLearner:
         """
         document, arrays = read_archive(path, "learner")
         with file_errors(path):
-            config = document["config"]
-            value = config["value"] | {"hidden": tuple(config["value"]["hidden"])}
-            learner = cls(MPC.from_json(document["mpc"]), document["learn"], document["preset"], document["seed"])
-            learner.config = LearnerConfig(config["trim"], ValueConfig(**value), FitConfig(**config["fit"]))
+            nominal = MPC.from_json(document["nominal"])
+            learner = cls(nominal, document["learn"], document["preset"], document["seed"], device=document["device"])
+            learner.config = LearnerConfig.from_json(document["config"])
             learner.history = [(int(epoch), dict(metrics)) for epoch, metrics in document["history"]]
             if document["result"] is not None:
-                theta = learner.nominal_mpc.space.checked(document["result"].pop("theta"))
-                losses = {name: float(loss) for name, loss in document["result"].items()}
-                learner.result = FitResult(theta, **losses)
+                learner._mpc = MPC.from_json(document["learned"])
+                learner.result = FitResult.from_json(document["result"], learner._mpc.theta)
             if document["observation_space"] is not None:
                 learner._observation_space = box_from_json(document["observation_space"])
             if arrays:
@@ -246,34 +276,14 @@ class OfflineMPCLearner:
         return learner
 
 
-def _overridden(config: LearnerConfig, overrides: dict[str, Any]) -> LearnerConfig:
-    """The configuration with fields replaced by name; a name that both parts have needs its prefix."""
-    parts: dict[str, ValueConfig | FitConfig] = {"value": config.value, "fit": config.fit}
-    own = {f.name for part in parts.values() for f in fields(part)}
-    shared = {f.name for f in fields(config.value)} & {f.name for f in fields(config.fit)}
-    accepted: dict[str, tuple[str, str]] = {}
-    for prefix, part in parts.items():
-        for f in fields(part):
-            accepted[f"{prefix}_{f.name}"] = (prefix, f.name)
-            if f.name in own - shared:
-                accepted[f.name] = (prefix, f.name)
-    changes: dict[str, dict[str, Any]] = {"value": {}, "fit": {}}
-    trim = overrides.pop("trim", config.trim)
-    for name, value in overrides.items():
-        if name not in accepted:
-            raise UnknownIdError.of("option of OfflineMPCLearner", name, ["trim", *accepted])
-        prefix, field_name = accepted[name]
-        changes[prefix][field_name] = value
-    return LearnerConfig(trim, replace(config.value, **changes["value"]), replace(config.fit, **changes["fit"]))
-
-
 class _Progress:
-    """A progress bar over the phases of a fit, and their history."""
+    """A progress bar over the phases of a fit."""
 
     def __init__(self, show: bool) -> None:
         from rich.progress import Progress
 
         self._bar = Progress(disable=not show, transient=False)
+        self._tasks: dict[str, Any] = {}
 
     def __enter__(self) -> _Progress:
         self._bar.start()
@@ -282,13 +292,14 @@ class _Progress:
     def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
-    def phase(self, title: str, history: History) -> Report:
-        """A report that moves the bar and appends to the history."""
-        task = self._bar.add_task(title, total=None)
-
-        def report(steps_done: int, steps_total: int, metrics: Metrics) -> None:
-            history.append((len(history) + 1, metrics))
-            shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-            self._bar.update(task, completed=steps_done, total=steps_total, description=f"{title}: {shown}")
-
-        return report
+    def show(self, epoch: Epoch) -> None:
+        """Moves the bar of the epoch's phase."""
+        if epoch.phase not in self._tasks:
+            self._tasks[epoch.phase] = self._bar.add_task(epoch.phase)
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
+        self._bar.update(
+            self._tasks[epoch.phase],
+            completed=epoch.step,
+            total=epoch.n_steps,
+            description=f"{epoch.phase}: {shown}",
+        )

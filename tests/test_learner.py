@@ -27,12 +27,14 @@ from mpcoffline.errors import (
     MPCOfflineError,
     UnknownIdError,
 )
-from mpcoffline.learner import PRESETS, LearnerConfig, OfflineMPCLearner
-from mpcoffline.learning import FitConfig, ValueConfig, ValueFunction
+from mpcoffline.learner import OfflineMPCLearner
+from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
+from mpcoffline.presets import PRESETS
 from mpcoffline.tasks import nominal_mpc
 
 QUICK: dict[str, Any] = {
+    "preset": "paper",
     "hidden": (16, 16),
     "value_n_steps": 60,
     "value_batch_size": 64,
@@ -245,15 +247,11 @@ def test_learning_solves_no_mpc(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---------------------------------------------------------------- options
 
 
-def test_overrides_reach_their_field() -> None:
-    learner = OfflineMPCLearner(
-        make_mpc(), value="expectile", tau=0.1, prior=0.5, value_n_steps=7, fit_n_steps=9, trim=0.8, hidden=(3,)
+def test_the_preset_is_the_default_one() -> None:
+    assert OfflineMPCLearner(make_mpc()).config == PRESETS["default"]
+    assert OfflineMPCLearner(make_mpc(), value="td", horizon=7).config == PRESETS["default"].replaced(
+        {"method": "td", "horizon": 7}
     )
-    assert learner.config == LearnerConfig(
-        0.8, ValueConfig(method="expectile", tau=0.1, n_steps=7, hidden=(3,)), FitConfig(prior=0.5, n_steps=9)
-    )
-    assert OfflineMPCLearner(make_mpc()).config == PRESETS["paper"]
-    assert PRESETS["paper"].value.method == "residual"
 
 
 @pytest.mark.parametrize(
@@ -282,6 +280,88 @@ def test_before_fit_there_is_nothing_to_hand_out() -> None:
     for name in ("mpc", "theta", "policy"):
         with pytest.raises(MPCOfflineError, match=r"expected a fitted learner, got no fit yet. Call fit\(dataset\)"):
             getattr(learner, name)
+
+
+# ---------------------------------------------------------------- epochs
+
+
+def test_fitter_yields_what_fit_returns() -> None:
+    table = lq_plant.random_log(300)
+    learner, other = quick(), quick()
+    epochs = list(learner.fitter(table, show_progress=False))
+    assert epochs == other.fit(table, show_progress=False) == learner.history
+    same_fit(learner, other)
+
+
+def test_callbacks_and_evaluators_see_every_epoch() -> None:
+    seen: list[tuple[int, int]] = []
+    lengths: list[int] = []
+
+    def evaluator(learner: OfflineMPCLearner, table: TransitionTable) -> float:
+        lengths.append(len(table))
+        return float(np.abs(learner.theta - learner.nominal_mpc.theta).max())
+
+    history = quick().fit(
+        lq_plant.random_log(300),
+        n_steps=50,
+        n_steps_per_epoch=20,
+        evaluators={"moved": evaluator},
+        callbacks=[lambda learner, epoch, total_step: seen.append((epoch, total_step))],
+        show_progress=False,
+    )
+    assert seen == [(1, 20), (2, 40), (3, 50), (4, 70), (5, 80), (6, 81)]
+    assert [set(metrics) for _, metrics in history] == [{"value_loss"}] * 3 + [{"fit_loss", "moved"}] * 3
+    assert lengths == [300] * 3
+    assert all(metrics["moved"] > 0.0 for _, metrics in history[3:])
+
+
+class Interruption(Exception):
+    """What a callback raises to end a fit."""
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 4, 5])
+def test_an_interrupted_fit_ends_at_the_same_bits(tmp_path: Path, stop_after: int) -> None:
+    table, file = lq_plant.random_log(300), tmp_path / "fit.zip"
+
+    def stop(learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:
+        if epoch == stop_after + 1:
+            raise Interruption
+
+    options: dict[str, Any] = {"n_steps_per_epoch": 20, "show_progress": False}
+    whole = quick()
+    whole.fit(table, **options)
+    with pytest.raises(Interruption):
+        quick().fit(table, callbacks=[stop], checkpoint=file, **options)
+    resumed = quick()
+    resumed.fit(table, checkpoint=file, **options)
+    same_fit(whole, resumed)
+    assert resumed.history == whole.history
+    again = quick()
+    again.fit(table, checkpoint=file, **options)  # nothing is left to do but the last epoch
+    same_fit(whole, again)
+    assert again.history == whole.history
+
+
+def test_a_checkpoint_of_another_fit_is_refused_and_kept(tmp_path: Path) -> None:
+    file = tmp_path / "fit.zip"
+    quick().fit(lq_plant.random_log(300), checkpoint=file, show_progress=False)
+    content = file.read_bytes()
+    for learner, table in (
+        (quick(seed=1), lq_plant.random_log(300)),
+        (quick(prior=0.5), lq_plant.random_log(300)),
+        (quick(learn="cost"), lq_plant.random_log(300)),
+        (quick(), lq_plant.random_log(301)),
+    ):
+        with pytest.raises(InvalidArgumentError, match="checkpoint: expected a checkpoint of the same data"):
+            learner.fit(table, checkpoint=file, show_progress=False)
+    assert file.read_bytes() == content
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "fit.zip"
+    file.write_bytes(b"PK no zip")
+    with pytest.raises(FileFormatError, match="an mpcoffline checkpoint file"):
+        quick().fit(lq_plant.random_log(300), checkpoint=file, show_progress=False)
 
 
 # ---------------------------------------------------------------- bad data

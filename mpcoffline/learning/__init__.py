@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from .regression import FitConfig, FitResult, fit_parameters
-from .value import VALUE_METHODS, ValueConfig, ValueFunction, fit_value
+from .regression import FitConfig, FitResult, ParameterTraining, fit_parameters
+from .value import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
 
 __all__ = [
     "VALUE_METHODS",
     "FitConfig",
     "FitResult",
+    "ParameterTraining",
     "ValueConfig",
     "ValueFunction",
+    "ValueTraining",
     "fit_parameters",
     "fit_value",
 ]

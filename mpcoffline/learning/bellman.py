@@ -89,4 +89,5 @@ class PredictionError:
     def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean error over a minibatch, a scalar."""
         missed = batch.next_observations.double() - self._problem.predicted(batch, theta)
-        return (missed / self._scale).square().mean()
+        error: Tensor = (missed / self._scale).square().mean()
+        return error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -85,6 +87,15 @@ class FitResult:
     at_bounds: tuple[str, ...] = ()
     potential: Potential | None = None
 
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description, without theta and the potential, which the learned MPC's terminal cost has in it."""
+        return {"loss_before": self.loss_before, "loss_after": self.loss_after, "at_bounds": list(self.at_bounds)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], theta: Array) -> FitResult:
+        """The inverse of :meth:`to_json`."""
+        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), tuple(map(str, data["at_bounds"])))
+
 
 class ParameterTraining:
     """The state of (FIT) between its steps: Adam on cost and model together, then the convex fit of the cost.
@@ -147,6 +158,11 @@ class ParameterTraining:
         self._optimiser = torch.optim.Adam([self._z], lr=self.config.learning_rate)
 
     @property
+    def theta(self) -> Array:
+        """The parameters reached so far, ``(size,)``."""
+        return canonical(self._mpc, self._coordinates.theta(self._z.detach()).numpy())
+
+    @property
     def done(self) -> bool:
         """Whether all gradient steps are made."""
         return self.step >= self.n_steps
@@ -203,7 +219,7 @@ class ParameterTraining:
         """The convex fit of the cost from where the gradient steps ended; theta_0's model where they all failed."""
         theta = self._mpc.theta
         if self.n_steps and not self._failed():
-            theta = canonical(self._mpc, self._coordinates.theta(self._z.detach()).numpy())
+            theta = self.theta
         elif self.n_steps:
             _log.warning("(FIT) of cost and model failed in every attempt; the model stays as it was")
         config = self.config

@@ -1,0 +1,218 @@
+"""One fit, from a table of transitions to a learned MPC, in epochs between which it can stop and go on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.learning import FitResult, ParameterTraining, ValueFunction, ValueTraining
+from mpcoffline.learning.terminal import fit_terminal
+from mpcoffline.mpc import MPC, NormCost, QuadraticCost
+from mpcoffline.presets import LearnerConfig
+
+Arrays = dict[str, NDArray[Any]]
+
+_log = logging.getLogger(__name__)
+
+
+class Epoch(NamedTuple):
+    """A stretch of a fit.
+
+    Attributes:
+        phase: What was done, for people.
+        step: Steps of the phase done so far.
+        n_steps: Steps of the phase in all.
+        total_step: Steps of all phases done so far.
+        metrics: Means over the epoch.
+    """
+
+    phase: str
+    step: int
+    n_steps: int
+    total_step: int
+    metrics: dict[str, float]
+
+
+class Fit:
+    """The regressions of arXiv:2301.01667 one after the other; no MPC is solved.
+
+    In this order: identification of the model and removal of measurement noise (``init="identified"``), V_phi by
+    (VALUE), theta by (FIT), the terminal cost from V. Each is optional or has a simplest form; see
+    :class:`~mpcoffline.presets.LearnerConfig`.
+
+    Args:
+        nominal: MPC_1.
+        groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
+        config: What is done, and how.
+        table: The transitions.
+        seed: Seeds everything.
+        device: Torch device for (VALUE).
+        value_function: A V_phi learned before; (VALUE) is skipped.
+
+    Attributes:
+        learned: The MPC as far as it is learned; None before the first epoch of (FIT).
+        value_function: V_phi, once it is learned.
+        result: What (FIT) found, once it is done.
+    """
+
+    def __init__(
+        self,
+        nominal: MPC,
+        groups: tuple[str, ...],
+        config: LearnerConfig,
+        table: TransitionTable,
+        *,
+        seed: int,
+        device: str = "cpu",
+        value_function: ValueFunction | None = None,
+    ) -> None:
+        table.check_fits(nominal.nx, nominal.nu, np.asarray(nominal.action_low), np.asarray(nominal.action_high))
+        self._groups, self._config, self._table = groups, config, table
+        self._seed, self._device = seed, device
+        self._nominal, self._mpc = nominal, restructured(nominal, config)
+        self.learned: MPC | None = None
+        self.value_function = value_function
+        self.result: FitResult | None = None
+        self._total_step = 0
+        self._trainings: dict[str, ValueTraining | ParameterTraining] = {}
+        self._restored: dict[str, Arrays] = {}
+
+    def epochs(self, value_epoch: int = 500, fit_epoch: int = 100) -> Iterator[Epoch]:
+        """Runs the fit; yields at the end of each epoch.
+
+        Args:
+            value_epoch: Steps of (VALUE) in an epoch.
+            fit_epoch: Steps of (FIT) in an epoch.
+
+        Raises:
+            InvalidDataError: If the data do not fit.
+            MPCOfflineError: If a regression fails.
+        """
+        table = self._identified(self._table).trim(self._config.trim)
+        if self.value_function is None:
+            yield from self._learn_value(table, value_epoch)
+        yield from self._learn_parameters(table, fit_epoch)
+
+    def _identified(self, table: TransitionTable) -> TransitionTable:
+        """The table without measurement noise; the model, where it is learned, by its prediction error."""
+        if self._config.init == "nominal":
+            return table
+        from mpcoffline.learning.smoothing import identify_smoothed
+
+        found = identify_smoothed(self._mpc, table, seed=self._seed)
+        if "model" in self._groups:
+            self._mpc = self._mpc.with_theta(found.identification.theta)
+        return found.table
+
+    def _learn_value(self, table: TransitionTable, epoch: int) -> Iterator[Epoch]:
+        training = ValueTraining(table, self._mpc.discount, self._config.value, seed=self._seed, device=self._device)
+        self._begin("value", training)
+        while not training.done:
+            metrics = training.advance(epoch)
+            yield Epoch("(VALUE) learning V", training.step, training.n_steps, training.step, metrics)
+        self._total_step = training.step
+        self.value_function = training.result.cpu()
+
+    def _learn_parameters(self, table: TransitionTable, epoch: int) -> Iterator[Epoch]:
+        value = self.value_function
+        if value is None:  # (VALUE) has ended, or V was given
+            return
+        training = ParameterTraining(self._mpc, value, table, self._groups, self._config.fit, seed=self._seed)
+        self._begin("fit", training)
+        phase, n_steps = f"(FIT) learning {'+'.join(self._groups)}", training.n_steps + 1
+        while not training.done:
+            metrics = training.advance(epoch)
+            self.learned = self._mpc.with_theta(training.theta)
+            yield Epoch(phase, training.step, n_steps, self._total_step + training.step, metrics)
+        result = training.finish()
+        self.learned = self._with_terminal_cost(self._mpc.with_theta(result.theta), value, result, table)
+        self.result = replace(result, theta=self.learned.theta)
+        yield Epoch(phase, n_steps, n_steps, self._total_step + n_steps, {"fit_loss": result.loss_after})
+
+    def _with_terminal_cost(self, mpc: MPC, value: ValueFunction, result: FitResult, table: TransitionTable) -> MPC:
+        """The MPC with the terminal cost that the configuration asks for: T = V - Phi, or none from V."""
+        kind, config = self._config.terminal, self._config
+        if kind == "given":
+            return mpc
+        if kind == "norm":
+            return mpc.replace(terminal_cost=NormCost(_reference(mpc)))
+        potential = result.potential
+        terminal_cost = fit_terminal(
+            kind,
+            value if potential is None else lambda s: value(s) - potential(s).float(),
+            table.observations,
+            x_ref=_reference(mpc),
+            blend=config.terminal_blend,
+            seed=self._seed,
+        )
+        return mpc.replace(terminal_cost=terminal_cost)
+
+    def _begin(self, name: str, training: ValueTraining | ParameterTraining) -> None:
+        """Makes a regression known to :meth:`to_arrays`, and takes it to where it was interrupted."""
+        self._trainings[name] = training
+        if name in self._restored:
+            training.restore(self._restored.pop(name))
+
+    @property
+    def identity(self) -> str:
+        """What decides the result (data, MPC, configuration, seed) as a SHA-256."""
+        described = {
+            "nominal": self._nominal.to_json(),
+            "groups": self._groups,
+            "config": asdict(self._config),
+            "seed": self._seed,
+        }
+        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        digest.update(np.ascontiguousarray(self._table.rows))
+        if self.value_function is not None:
+            for array in self.value_function.to_arrays().values():
+                digest.update(np.ascontiguousarray(array))
+        return digest.hexdigest()
+
+    def to_arrays(self) -> Arrays:
+        """What :meth:`restore` needs, between two epochs."""
+        return {
+            f"{name}/{key}": array
+            for name, training in self._trainings.items()
+            for key, array in training.to_arrays().items()
+        }
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Makes :meth:`epochs` go on from a state of :meth:`to_arrays` of a fit with the same arguments."""
+        for name in ("value", "fit"):
+            own = {key.removeprefix(f"{name}/"): a for key, a in arrays.items() if key.startswith(f"{name}/")}
+            if own:
+                self._restored[name] = own
+
+
+def restructured(nominal: MPC, config: LearnerConfig) -> MPC:
+    """The MPC with the discount, the horizon and the form of stage cost that a configuration asks for."""
+    discount = max(nominal.discount, config.least_discount) if config.discount is None else config.discount
+    horizon = nominal.horizon if config.horizon is None else config.horizon
+    mpc = nominal.replace(discount=discount, horizon=horizon)
+    cost = nominal.stage_cost
+    if config.cross_term and isinstance(cost, QuadraticCost) and cost.nu and "H" not in cost.values:
+        cross = np.zeros((cost.nx, cost.nu))
+        values = cost.values
+        constant = float(values["constant"])
+        crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
+        return mpc.replace(stage_cost=crossed)
+    if config.cross_term:
+        _log.info("cross_term has no effect on a stage cost that is not quadratic or has one already")
+    return mpc
+
+
+def _reference(mpc: MPC) -> NDArray[np.float64]:
+    """Where the MPC is to go: the reference of its stage cost or terminal cost, else the origin."""
+    for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
+        if name in mpc.values:
+            return mpc.values[name]
+    return np.zeros(mpc.nx)
