@@ -6,6 +6,7 @@ from .component import StageCost, TerminalCost
 from .constraints import Constraint, Penalty, StateBounds
 from .cost import NormCost, QuadraticCost
 from .model import Model
+from .networks import NetworkCost
 from .parameters import Block, Parameter, ParameterSpace
 from .problem import MPC
 
@@ -14,6 +15,7 @@ __all__ = [
     "Block",
     "Constraint",
     "Model",
+    "NetworkCost",
     "NormCost",
     "Parameter",
     "ParameterSpace",

@@ -7,6 +7,10 @@ from collections.abc import Mapping
 from typing import Any, Protocol, Self
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mpcoffline.errors import InvalidArgumentError
 
 from .parameters import Array, Block, ParameterSpace
 
@@ -37,7 +41,11 @@ class Component:
 
 
 class StageCost(Protocol):
-    """The stage cost Lhat_theta(x, u) of (MPC)."""
+    """The stage cost Lhat_theta(x, u) of (MPC).
+
+    A class may say ``convex = True``: the Hessian in (x, u) is positive semidefinite everywhere, for every theta within
+    its bounds. A class that says nothing counts as not convex; solvers that need a convex model make one of it.
+    """
 
     space: ParameterSpace
 
@@ -52,7 +60,7 @@ class StageCost(Protocol):
 
 
 class TerminalCost(Protocol):
-    """The terminal cost T_theta(x) of (MPC)."""
+    """The terminal cost T_theta(x) of (MPC); ``convex = True`` means the same as in :class:`StageCost`."""
 
     space: ParameterSpace
 
@@ -69,3 +77,28 @@ class TerminalCost(Protocol):
 def blocks_from_json(data: Mapping[str, Any]) -> ParameterSpace:
     """The parameter blocks of a component's JSON form."""
     return ParameterSpace([Block.from_json(block) for block in data["blocks"]])
+
+
+def difference(name: str, variable: ca.SX, reference: ca.SX) -> ca.SX:
+    """Variable - reference of equal sizes; CasADi alone would stretch a scalar over a vector.
+
+    Raises:
+        InvalidArgumentError: If the sizes differ.
+    """
+    if variable.shape != reference.shape:
+        raise InvalidArgumentError(
+            f"{name}_ref", expected=f"{variable.shape[0]} numbers, as {name}", actual=str(reference.shape[0])
+        )
+    return variable - reference
+
+
+def vector(name: str, given: ArrayLike | None, size: int, default: float = 0.0) -> Array:
+    """The numbers given ``(size,)``, or all ``default``.
+
+    Raises:
+        InvalidArgumentError: For another shape.
+    """
+    numbers = np.full(size, default) if given is None else np.atleast_1d(np.asarray(given, dtype=np.float64))
+    if numbers.shape != (size,):
+        raise InvalidArgumentError(name, expected=f"shape ({size},)", actual=f"shape {numbers.shape}")
+    return numbers

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
-from .component import Component, blocks_from_json
+from .component import Component, blocks_from_json, difference, vector
+from .networks import NetworkCost
 from .parameters import Array, Block, ParameterSpace
 
 
@@ -37,6 +38,8 @@ class QuadraticCost(Component):
         InvalidArgumentError: If shapes do not fit, or the weights are not symmetric positive semidefinite.
     """
 
+    convex: ClassVar[bool] = True
+
     def __init__(
         self,
         W: ArrayLike,
@@ -58,8 +61,8 @@ class QuadraticCost(Component):
             input_weight = np.atleast_2d(np.asarray(R, dtype=np.float64))
             nu = input_weight.shape[0]
             blocks += _weight_blocks(weight, input_weight, S)
-            blocks.append(Block.free("u_ref", _reference("u_ref", u_ref, nu), "reference"))
-        blocks.append(Block.free("x_ref", _reference("x_ref", x_ref, nx), "reference"))
+            blocks.append(Block.free("u_ref", vector("u_ref", u_ref, nu), "reference"))
+        blocks.append(Block.free("x_ref", vector("x_ref", x_ref, nx), "reference"))
         blocks.append(Block.free("constant", float(constant), "cost"))
         self.nx, self.nu = nx, nu
         self.space = ParameterSpace(blocks)
@@ -92,18 +95,18 @@ class QuadraticCost(Component):
 
     def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that e'We = |C'e|^2."""
-        e = _difference("x", x, p["x_ref"])
+        e = difference("x", x, p["x_ref"])
         if "H" in p:
-            return ca.sumsqr(p["H"].T @ ca.vertcat(e, _difference("u", u, p["u_ref"]))) + p["constant"]
+            return ca.sumsqr(p["H"].T @ ca.vertcat(e, difference("u", u, p["u_ref"]))) + p["constant"]
         cost = ca.sumsqr(p["W"].T @ e) + p["constant"]
         if "R" in p:
-            cost += ca.sumsqr(p["R"].T @ _difference("u", u, p["u_ref"]))
+            cost += ca.sumsqr(p["R"].T @ difference("u", u, p["u_ref"]))
         return cost
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """E'We + constant as a CasADi scalar."""
         factor = p["W"] if "W" in p else p["H"][: self.nx, :]
-        return ca.sumsqr(factor.T @ _difference("x", x, p["x_ref"])) + p["constant"]
+        return ca.sumsqr(factor.T @ difference("x", x, p["x_ref"])) + p["constant"]
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> QuadraticCost:
@@ -133,6 +136,8 @@ class NormCost(Component):
         InvalidArgumentError: If ``eps`` is not positive.
     """
 
+    convex: ClassVar[bool] = True
+
     def __init__(self, x_ref: ArrayLike, eps: float = 0.1) -> None:
         if not (np.isfinite(eps) and eps > 0.0):
             raise InvalidArgumentError("eps", expected="a positive number", actual=str(eps))
@@ -142,7 +147,7 @@ class NormCost(Component):
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """(TERM), smoothed, as a CasADi scalar."""
-        return ca.sqrt(ca.sumsqr(_difference("x", x, p["x_ref"])) + self.eps**2) - self.eps
+        return ca.sqrt(ca.sumsqr(difference("x", x, p["x_ref"])) + self.eps**2) - self.eps
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description."""
@@ -157,10 +162,7 @@ class NormCost(Component):
         return cost
 
 
-_KINDS: dict[str, type[QuadraticCost] | type[NormCost]] = {
-    "QuadraticCost": QuadraticCost,
-    "NormCost": NormCost,
-}
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (QuadraticCost, NormCost, NetworkCost)}
 
 
 def cost_from_json(data: Mapping[str, Any]) -> Any:
@@ -173,22 +175,6 @@ def cost_from_json(data: Mapping[str, Any]) -> Any:
     if not isinstance(kind, str) or kind not in _KINDS:
         raise FileFormatError("cost", expected=f"one of {', '.join(_KINDS)}", actual=repr(kind))
     return _KINDS[kind].from_json(data)
-
-
-def _difference(name: str, variable: ca.SX, reference: ca.SX) -> ca.SX:
-    """Variable - reference of equal sizes; CasADi alone would stretch a scalar over a vector."""
-    if variable.shape != reference.shape:
-        raise InvalidArgumentError(
-            f"{name}_ref", expected=f"{variable.shape[0]} numbers, as {name}", actual=str(reference.shape[0])
-        )
-    return variable - reference
-
-
-def _reference(name: str, given: ArrayLike | None, size: int) -> Array:
-    reference = np.zeros(size) if given is None else np.atleast_1d(np.asarray(given, dtype=np.float64))
-    if reference.shape != (size,):
-        raise InvalidArgumentError(name, expected=f"shape ({size},)", actual=f"shape {reference.shape}")
-    return reference
 
 
 def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:
