@@ -64,8 +64,9 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
     fields = []
     for block in mpc.space:
         meaning = f"shape {block.shape}" if block.shape else "number"
+        meaning += ", row by row" if len(block.shape) == 2 else ""
         if block.kind == "psd":
-            meaning = f"lower triangle, row by row, of C in {block.name} = C C', {meaning}"
+            meaning = f"lower triangle, row by row, of C in {block.name} = C C', shape {block.shape}"
         size = f"[{block.size}]" if block.shape else ""
         unit = f", in {block.unit}" if block.unit else ""
         fields.append(f"    double {_identifier(block.name)}{size}; /* {block.name}: {meaning}{unit} */")

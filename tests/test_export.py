@@ -14,7 +14,7 @@ from mpc_problems import CARTPOLE, LINEAR, PENDULUM, random_linear, random_state
 from mpcoffline import MPCPolicy
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.export import export_c
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, NetworkCost
 from mpcoffline.solvers.ddp.build import find_compiler
 from mpcoffline.tasks import nominal_mpc
 
@@ -24,6 +24,9 @@ STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
 def mpc_of(case: str) -> MPC:
     if case == "three inputs":
         return random_linear(0, nu=3)
+    if case == "network":
+        network = NetworkCost.random(3, (12, 12), seed=0, scale=10.0, W=np.eye(3), x_ref=[1.0, 0.0, 0.0])
+        return nominal_mpc(PENDULUM).replace(horizon=10, discount=0.95, terminal_cost=network)
     mpc = nominal_mpc(case)
     return mpc.replace(horizon=min(mpc.horizon, 50))
 
@@ -36,7 +39,7 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
     return folder / "program"
 
 
-@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "three inputs"])
+@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "three inputs", "network"])
 def test_the_c_code_replays_its_vectors(case: str, tmp_path: Path) -> None:
     files = export_c(MPCPolicy(mpc_of(case)), tmp_path)
     assert {file.name for file in files} >= {"mpc_controller.c", "mpc_controller.h", "CMakeLists.txt"}
@@ -93,16 +96,20 @@ def test_the_header_documents_names_and_units(tmp_path: Path) -> None:
     assert re.search(r"double stage_cost_W\[6\]; /\* .*C C'", header)
     assert "every 0.05 s" in header
     assert "u[0]: from -2 to 2" in header
+    export_c(MPCPolicy(mpc_of("network")), tmp_path / "network")
+    header = (tmp_path / "network" / "mpc_controller.h").read_text()
+    assert re.search(r"double terminal_cost_weights_1\[144\]; /\* .*shape \(12, 12\), row by row \*/", header)
     source = (tmp_path / "mpc_controller.c").read_text()
     assert "malloc" not in source
     assert set(re.findall(r"#include\s+(\S+)", source)) == {'"mpc_controller.h"', "<math.h>", "<stdint.h>"}
 
 
 @pytest.mark.slow
-def test_sanitizers_find_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", [PENDULUM, "network"])
+def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
     if shutil.which("gcc") is None:
         pytest.skip("no gcc")
-    export_c(MPCPolicy(nominal_mpc(PENDULUM)), tmp_path)
+    export_c(MPCPolicy(mpc_of(case)), tmp_path)
     try:
         program = compiled(tmp_path, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     except AssertionError as error:

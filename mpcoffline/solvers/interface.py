@@ -171,7 +171,9 @@ class Solver(ABC):
         shape = (n_problems, *(() if array.ndim == 2 else (self.mpc.horizon + 1,)), space.size)
         if array.shape not in (shape, (1, *shape[1:])):
             raise InvalidArgumentError("theta", expected=f"shape {shape}", actual=f"shape {array.shape}")
-        for row in array.reshape(-1, space.size):
+        rows = array.reshape(-1, space.size)
+        extremes = rows.min(axis=0), rows.max(axis=0)
+        for row in extremes:
             space.checked(row)
         return np.broadcast_to(array, shape)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import resources
 
 import casadi as ca
@@ -9,7 +10,8 @@ import numpy as np
 
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.expressions import expanded, instructions
+from mpcoffline.mpc.component import StageCost, TerminalCost
+from mpcoffline.mpc.expressions import Instruction, expanded, instructions
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
 _FORMATS = {
@@ -44,6 +46,11 @@ _FORMATS = {
 }
 
 
+# GCC's effort grows with the square of a function's length. Only functions of costs that are networks are so long.
+_LONGEST = 2500
+_PIECE = 500
+
+
 def source(mpc: MPC) -> str:
     """The complete C source for an MPC; horizon, discount, bounds and theta are arguments of the compiled functions.
 
@@ -68,6 +75,7 @@ def generated(mpc: MPC) -> str:
     reached, cost = mpc.dynamics_function(x, u, theta), mpc.stage_function(x, u, theta)
     final = mpc.terminal_function(x, theta)
     final_hessian, final_gradient = ca.hessian(final, x)
+    hessian, slope = ca.hessian(cost, ca.vertcat(x, u))
     inputs = {
         "gen_step": [x, u],
         "gen_final": [x],
@@ -78,11 +86,18 @@ def generated(mpc: MPC) -> str:
         "gen_step": _stacked(reached, cost),
         "gen_final": _stacked(final),
         "gen_final_expand": _stacked(final_gradient, _triangle(final_hessian)),
-        "gen_q": _action_value(reached, cost, x, u, following, gradient, curvature, discount),
     }
+    if not is_convex(mpc.stage_cost):  # then gen_q takes the expansion as the kernel changed it
+        inputs["gen_stage_expand"], outputs["gen_stage_expand"] = [x, u], _stacked(slope, _triangle(hessian))
+        stage = ca.SX.sym("stage", outputs["gen_stage_expand"].numel())
+        inputs["gen_q"].append(stage)
+        slope, hessian = stage[: mpc.nx + mpc.nu], _symmetric(stage[mpc.nx + mpc.nu :], mpc.nx + mpc.nu)
+    outputs["gen_q"] = _action_value(reached, slope, hessian, x, u, following, gradient, curvature, discount)
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
+    convex = int(is_convex(mpc.stage_cost)), int(is_convex(mpc.terminal_cost))
     parts = [
+        f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
         emit("gen_prepare", [theta], prepared),
         *(emit(name, [*inputs[name], parameters], body) for name, body in zip(outputs, bodies, strict=True)),
@@ -90,9 +105,15 @@ def generated(mpc: MPC) -> str:
     return "\n\n".join(parts)
 
 
+def is_convex(cost: StageCost | TerminalCost) -> bool:
+    """Whether a cost promises a positive semidefinite Hessian for every theta, by an attribute ``convex``."""
+    return bool(getattr(cost, "convex", False))
+
+
 def _action_value(
     reached: ca.SX,
-    cost: ca.SX,
+    stage_gradient: ca.SX,
+    stage_hessian: ca.SX,
     x: ca.SX,
     u: ca.SX,
     following: ca.SX,
@@ -102,13 +123,16 @@ def _action_value(
 ) -> ca.SX:
     """The quadratic model of Q(x, u) = L + gamma V(f(x, u)), V expanded at the successor that the trajectory names.
 
+    L's is given by its gradient and Hessian with respect to (x, u).
+
     Gauss-Newton: the curvature of f is left out. In the order that the kernel expects: the defect, Qx, Qu, Qxx (upper
     triangle), Qux, Quu.
     """
     Vxx = _symmetric(curvature, x.numel())
     fx, fu = ca.jacobian(reached, x), ca.jacobian(reached, u)
-    lxx, lx = ca.hessian(cost, x)
-    luu, lu = ca.hessian(cost, u)
+    nx = x.numel()
+    lx, lu = stage_gradient[:nx], stage_gradient[nx:]
+    lxx, lux, luu = stage_hessian[:nx, :nx], stage_hessian[nx:, :nx], stage_hessian[nx:, nx:]
     defect = reached - following
     slope = discount * (gradient + Vxx @ defect)
     weighted_fx, weighted_fu = discount * (Vxx @ fx), discount * (Vxx @ fu)
@@ -117,7 +141,7 @@ def _action_value(
         lx + fx.T @ slope,
         lu + fu.T @ slope,
         _triangle(lxx + fx.T @ weighted_fx),
-        ca.jacobian(lu, x) + fu.T @ weighted_fx,
+        lux + fu.T @ weighted_fx,
         luu + fu.T @ weighted_fu,
     )
 
@@ -150,31 +174,68 @@ def _stacked(*parts: ca.SX) -> ca.SX:
 
 
 def emit(name: str, inputs: list[ca.SX], output: ca.SX) -> str:
-    """One C function ``name(i0, i1, ..., out)`` of vectors of doubles.
+    """One C function ``name(i0, i1, ..., out)`` of vectors of doubles; a long one calls pieces of itself in turn.
 
     Raises:
         InvalidArgumentError: For an operation without a counterpart in C.
     """
     function = expanded(ca.Function(name, inputs, [output]))
-    arguments = ", ".join(f"const vd *i{k}" for k in range(len(inputs)))
-    lines = [f"static void {name}({arguments}, vd *out) {{"]
-    lines.append("    vd " + ", ".join(f"w{k}" for k in range(max(1, function.sz_w()))) + ";")
-    read = {sources[0] for op, sources, _, _ in instructions(function) if op == ca.OP_INPUT}
-    lines.extend(f"    (void)i{k};" for k in range(len(inputs)) if k not in read)
-    for op, sources, targets, constant in instructions(function):
+    program = list(instructions(function))
+    pointers = [f"i{k}" for k in range(len(inputs))]
+    arguments = "".join(f"const vd *{pointer}, " for pointer in pointers) + "vd *out"
+    if len(program) <= _LONGEST:
+        return _function(name, arguments, _statements(name, program, len(program)), pointers)
+    work, pieces, calls = f"vd w[{function.sz_w()}];", [], []
+    statements = _statements(name, program, _PIECE)
+    for k, start in enumerate(range(0, len(program), _PIECE)):
+        lines = statements[start : start + _PIECE]
+        pieces.append(
+            _function(f"{name}_{k}", f"{arguments}, vd *restrict w", lines, [*pointers, "out", "w"], "NOINLINE ")
+        )
+        calls.append(f"{name}_{k}({', '.join(pointers)}, out, w);")
+    return "\n\n".join([*pieces, _function(name, arguments, [work, *calls], [])])
+
+
+def _function(name: str, arguments: str, statements: list[str], unused: list[str], attribute: str = "") -> str:
+    """A C function; of ``unused``, those that the statements do not name are marked so."""
+    named = set(re.findall(r"\b(?:i\d+|out|w)\b", " ".join(statements)))
+    marks = [f"(void){argument};" for argument in unused if argument not in named]
+    lines = [f"    {line}" for line in (*marks, *statements)]
+    return "\n".join([f"{attribute}static void {name}({arguments}) {{", *lines, "}"])
+
+
+def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
+    """One C statement an instruction; values that a later piece reads go through the array ``w`` of all pieces."""
+    value_in: dict[int, int] = {}  # by place in the work vector: the instruction whose value is there
+    read: list[dict[int, int]] = []  # of each instruction: the places that it reads, and whose values they are
+    last_read: dict[int, int] = {}
+    for k, (op, sources, targets, _) in enumerate(program):
+        read.append({} if op in (ca.OP_INPUT, ca.OP_CONST) else {place: value_in[place] for place in sources})
+        last_read.update(dict.fromkeys(read[-1].values(), k))
+        if op != ca.OP_OUTPUT:
+            value_in[targets[0]] = k
+    statements = []
+    for k, (op, sources, targets, constant) in enumerate(program):
+        start = k - k % piece
+        names = [
+            f"v{read[k][place]}" if read[k][place] >= start else f"w[{place}]" for place in sources if place in read[k]
+        ]
+        if op == ca.OP_OUTPUT:
+            statements.append(f"out[{targets[1]}] = {names[0]};")
+            continue
         if op == ca.OP_CONST:
-            lines.append(f"    w{targets[0]} = V({_literal(constant)});")
+            result = f"V({_literal(constant)})"
         elif op == ca.OP_INPUT:
-            lines.append(f"    w{targets[0]} = i{sources[0]}[{sources[1]}];")
-        elif op == ca.OP_OUTPUT:
-            lines.append(f"    out[{targets[1]}] = w{sources[0]};")
+            result = f"i{sources[0]}[{sources[1]}]"
         elif op in _INFIX:
-            lines.append(f"    w{targets[0]} = w{sources[0]} {_INFIX[op]} w{sources[1]};")
+            result = f"{names[0]} {_INFIX[op]} {names[1]}"
         elif op in _FORMATS:
-            lines.append(f"    w{targets[0]} = {_FORMATS[op].format(*(f'w{k}' for k in sources))};")
+            result = _FORMATS[op].format(*names)
         else:
             raise InvalidArgumentError(name, expected="operations that C has", actual=f"CasADi operation {op}")
-    return "\n".join([*lines, "}"])
+        kept = f" w[{targets[0]}] = v{k};" if last_read.get(k, k) >= start + piece else ""
+        statements.append(f"const vd v{k} = {result};{kept}")
+    return statements
 
 
 def _literal(value: float) -> str:

@@ -8,10 +8,13 @@
  *   gen_prepare(theta, out):   what depends on theta alone [NQ]; the others take p = (theta, that)
  *   gen_step(x, u, p, out):    x+ [NX], L [1]
  *   gen_q(x, u, x_next, Vx, Vxx, gamma, p, out):  f(x, u) - x_next [NX], Qx [NX], Qu [NU], Qxx [NT], Qux [NU*NX],
- *                              Quu [NU*NU]
+ *                              Quu [NU*NU]; unless STAGE_CONVEX, what gen_stage_expand gave comes before p
+ *   gen_stage_expand(x, u, p, out): unless STAGE_CONVEX: gradient of L by (x, u) [NZ], Hessian [NZ (NZ + 1) / 2]
  *   gen_final(x, p, out):      T [1]
  *   gen_final_expand(x, p, out): Tx [NX], Txx [NT]
- * with matrices column-major, and Vxx, Qxx, Txx as upper triangles column by column (NT = NX (NX + 1) / 2).
+ * with matrices column-major, and Vxx, Qxx, Txx and the Hessian of L as upper triangles column by column
+ * (NT = NX (NX + 1) / 2, NZ = NX + NU); and STAGE_CONVEX, TERMINAL_CONVEX: whether L, T are convex for any theta. Of
+ * those that are not, the positive semidefinite part of the Hessian is used.
  *
  * Nothing here knows how many lanes there are: vd is one double or a vector of them, vl the result of comparing them.
  *
@@ -31,6 +34,7 @@ enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING 
 #define RACE_ITERATIONS 4                 /* of each start of a cold solve, before the best go on */
 #define FINALISTS(starts) (((starts) + 5) / 6)
 #define NT (NX * (NX + 1) / 2)
+#define NZ (NX + NU)
 #define TRI(i, j) ((j) * ((j) + 1) / 2 + (i)) /* of an upper triangle, i <= j */
 
 typedef struct {
@@ -175,11 +179,91 @@ static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high
     *pd &= definite;
 }
 
+#if !STAGE_CONVEX || !TERMINAL_CONVEX
+#define JACOBI_SWEEPS 10 /* at most; four or five do */
+#define JACOBI_TOLERANCE 1e-14 /* of elements off the diagonal, relative to the largest of all */
+
+/* One Jacobi rotation of A that makes A[p][q] vanish; E, whose columns become eigenvectors, is rotated along. */
+static inline void rotate(int n, vd A[NZ][NZ], vd E[NZ][NZ], int p, int q, vl wanted) {
+    vd d = A[q][q] - A[p][p], twice = 2.0 * A[p][q];
+    vd t = twice / (vd_abs(d) + vd_sqrt(d * d + twice * twice));
+    t = vd_select(wanted, vd_select(vd_lt(d, V(0.0)), -t, t), V(0.0));
+    vd c = 1.0 / vd_sqrt(1.0 + t * t), s = t * c;
+    for (int k = 0; k < n; ++k) {
+        vd a = A[k][p], b = A[k][q], e = E[k][p], f = E[k][q];
+        A[k][p] = c * a - s * b, A[k][q] = s * a + c * b;
+        E[k][p] = c * e - s * f, E[k][q] = s * e + c * f;
+    }
+    for (int k = 0; k < n; ++k) {
+        vd a = A[p][k], b = A[q][k];
+        A[p][k] = c * a - s * b, A[q][k] = s * a + c * b;
+    }
+}
+
+/* H <- H - sum of min(l, 0) v v' over the eigenvalues l of the n x n upper triangle H and their eigenvectors v: its
+ * positive semidefinite part. A positive definite matrix is left as it is. */
+static inline void project(int n, vd *H) {
+    vd A[NZ][NZ], E[NZ][NZ], scale = V(0.0);
+    vl definite = all_lanes();
+    for (int j = 0; j < n; ++j) { /* A <- L with H = L D L', for its signs */
+        for (int i = j; i < n; ++i) {
+            A[i][j] = H[TRI(j, i)];
+            for (int l = 0; l < j; ++l) A[i][j] -= A[i][l] * E[j][l];
+        }
+        definite &= vd_lt(V(0.0), A[j][j]);
+        for (int i = j + 1; i < n; ++i) E[i][j] = A[i][j] / A[j][j];
+    }
+    if (!vl_any(~definite)) return;
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j) {
+            A[i][j] = H[i < j ? TRI(i, j) : TRI(j, i)];
+            E[i][j] = V(i == j ? 1.0 : 0.0);
+            scale = vd_max(scale, vd_abs(A[i][j]));
+        }
+    for (int sweep = 0; sweep < JACOBI_SWEEPS; ++sweep) {
+        vl any = no_lanes();
+        for (int p = 0; p < n; ++p)
+            for (int q = p + 1; q < n; ++q) {
+                vl wanted = vd_lt(JACOBI_TOLERANCE * scale, vd_abs(A[p][q]));
+                if (!vl_any(wanted)) continue; /* lanes that have nothing to rotate are left alone in either case */
+                rotate(n, A, E, p, q, wanted);
+                any |= wanted;
+            }
+        if (!vl_any(any)) break;
+    }
+    for (int l = 0; l < n; ++l) {
+        vd lift = vd_select(definite, V(0.0), vd_max(-A[l][l], V(0.0)));
+        for (int j = 0; j < n; ++j)
+            for (int i = 0; i <= j; ++i) H[TRI(i, j)] += lift * E[i][l] * E[j][l];
+    }
+}
+#endif
+
+/* The quadratic models of T and of Q(x, u) = L + gamma V(f(x, u)); of costs that need not be convex, made so. */
+static void expand_final(const vd *x, const vd *p, vd *out) {
+    gen_final_expand(x, p, out);
+#if !TERMINAL_CONVEX
+    project(NX, out + NX);
+#endif
+}
+
+static void expand_stage(const vd *x, const vd *u, const vd *x_next, const vd *Vx, const vd *Vxx, const vd *discount,
+                         const vd *p, vd *out) {
+#if STAGE_CONVEX
+    gen_q(x, u, x_next, Vx, Vxx, discount, p, out);
+#else
+    vd stage[NZ + NZ * (NZ + 1) / 2];
+    gen_stage_expand(x, u, p, stage);
+    project(NZ, stage + NZ);
+    gen_q(x, u, x_next, Vx, Vxx, discount, stage, p, out);
+#endif
+}
+
 /* Riccati recursion along (x, u): gains k, K, the predicted decrease of J, and where Quu was positive definite. */
 static void backward(const mpc_problem *m, lanes *w) {
     vd Vx[NX], Vxx[NT], out[NX + NX + NU + NT + NU * NX + NU * NU];
     int64_t N = m->horizon;
-    gen_final_expand(w->x + N * NX, w->p, out);
+    expand_final(w->x + N * NX, w->p, out);
     for (int i = 0; i < NX; ++i) Vx[i] = out[i];
     for (int i = 0; i < NT; ++i) Vxx[i] = out[NX + i];
     double weight = 1.0;
@@ -189,7 +273,7 @@ static void backward(const mpc_problem *m, lanes *w) {
     w->predicted = w->defect = V(0.0);
     for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
         const vd *u = w->u + k * NU;
-        gen_q(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
+        expand_stage(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
         const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NT, *Quu = Qux + NU * NX;
         for (int i = 0; i < NX; ++i) w->defect = vd_max(w->defect, vd_abs(out[i]));
         /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. */

@@ -28,15 +28,22 @@ static lanes *lanes_new(int64_t N) {
 /* One problem per lane; lane i works on problem queue[i] or on nothing (-1). */
 typedef struct {
     int64_t n;
-    const double *x0, *theta, *u0; /* (n, NX), (n, NP), (n, NU) or NULL */
+    const double *x0, *theta, *u0; /* (n, NX), (n, NP) or (NP), (n, NU) or NULL */
+    int64_t theta_stride;          /* NP, or 0: one theta for all */
     double *x, *u, *J, *predicted;  /* (n, N+1, NX), (n, N, NU): guess in, solution out; (n), (n) */
     int64_t *iterations, *status;  /* (n) */
     int cold;                       /* the guess is inputs only */
 } mpc_batch;
 
+/* One theta for all lanes. */
+static void load_theta(lanes *w, const double *theta) {
+    for (int j = 0; j < NP; ++j) w->p[j] = V(theta[j]);
+    gen_prepare(w->p, w->p + NP);
+}
+
 static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int lane, int64_t i) {
     int64_t N = m->horizon;
-    for (int j = 0; j < NP; ++j) w->p[j][lane] = b->theta[i * NP + j];
+    for (int j = 0; j < b->theta_stride; ++j) w->p[j][lane] = b->theta[i * b->theta_stride + j];
     for (int j = 0; j < NX; ++j) w->s[j][lane] = b->x0[i * NX + j];
     for (int a = 0; a < NU; ++a) {
         w->low0[a][lane] = b->u0 ? b->u0[i * NU + a] : m->low[a];
@@ -77,6 +84,7 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
     if (!w) return 1;
     int64_t problem[LANES], count[LANES], next = first;
     int fresh_any, busy;
+    if (!b->theta_stride) load_theta(w, b->theta);
     for (int l = 0; l < LANES; ++l) {
         problem[l] = -1;
         if (first < b->n) load_lane(m, b, w, l, first); /* lanes that get nothing to do repeat this one, ignored */
@@ -95,7 +103,7 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             busy |= problem[l] >= 0;
         }
         if (!busy) break;
-        if (fresh_any) gen_prepare(w->p, w->p + NP);
+        if (fresh_any && b->theta_stride) gen_prepare(w->p, w->p + NP);
         if (fresh_any && b->cold) {
             vd J = rollout_open(m, w, w->x_new, w->u);
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
@@ -123,8 +131,7 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
 static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, const double *theta, const double *u0,
                             const double *candidates, int64_t n_candidates, double *J) {
     int64_t size = m->horizon * NU;
-    for (int j = 0; j < NP; ++j) w->p[j] = V(theta[j]);
-    gen_prepare(w->p, w->p + NP);
+    load_theta(w, theta);
     for (int j = 0; j < NX; ++j) w->s[j] = V(x0[j]);
     for (int64_t c = 0; c < n_candidates; c += LANES) {
         for (int l = 0; l < LANES; ++l)
@@ -148,10 +155,11 @@ static void swap(double *a, double *b, int64_t n) {
 
 /* Cold solve of one problem from the cheapest candidates; the best solution goes to row i of the batch. */
 static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
-                      int64_t n_candidates, double *J, lanes *w, const mpc_batch *starts) {
+                      int64_t n_candidates, double *J, lanes *w, mpc_batch *starts) {
     int64_t N = m->horizon, best = 0;
     const double *u0 = b->u0 ? b->u0 + i * NU : NULL;
-    candidate_costs(m, w, b->x0 + i * NX, b->theta + i * NP, u0, candidates, n_candidates, J);
+    starts->theta = b->theta + i * b->theta_stride;
+    candidate_costs(m, w, b->x0 + i * NX, starts->theta, u0, candidates, n_candidates, J);
     for (int64_t l = 0; l < starts->n; ++l) {
         int64_t cheapest = 0;
         for (int64_t c = 1; c < n_candidates; ++c)
@@ -159,7 +167,6 @@ static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const
         J[cheapest] = INFINITY;
         memcpy(starts->u + l * N * NU, candidates + cheapest * N * NU, N * NU * sizeof(double));
         memcpy((double *)starts->x0 + l * NX, b->x0 + i * NX, NX * sizeof(double));
-        memcpy((double *)starts->theta + l * NP, b->theta + i * NP, NP * sizeof(double));
         if (u0) memcpy((double *)starts->u0 + l * NU, u0, NU * sizeof(double));
     }
     /* A few iterations show which starts lead somewhere; only the best go on. */
@@ -203,7 +210,7 @@ static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const
 
 int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candidates, int64_t n_candidates,
                    int64_t n_starts, int64_t first, int64_t stride) {
-    int64_t N = m->horizon, row = (N + 1) * NX + N * NU + NX + NP + NU + 2;
+    int64_t N = m->horizon, row = (N + 1) * NX + N * NU + NX + NU + 2;
     double *memory = calloc(n_starts * row + n_candidates, sizeof(double));
     int64_t *flags = calloc(2 * n_starts, sizeof(int64_t));
     lanes *w = lanes_new(N);
@@ -214,7 +221,6 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
         starts.x = q; q += n_starts * (N + 1) * NX;
         starts.u = q; q += n_starts * N * NU;
         starts.x0 = q; q += n_starts * NX;
-        starts.theta = q; q += n_starts * NP;
         starts.u0 = b->u0 ? q : NULL; q += n_starts * NU;
         starts.J = q; q += n_starts;
         starts.predicted = q;

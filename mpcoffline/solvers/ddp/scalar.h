@@ -5,6 +5,7 @@ typedef double vd;
 typedef int vl;
 
 #define V(a) ((vd)(a))
+#define NOINLINE
 #define vl_any(mask) (mask)
 static inline vd vd_select(vl mask, vd a, vd b) { return mask ? a : b; }
 static inline vl vd_lt(vd a, vd b) { return -(a < b); }

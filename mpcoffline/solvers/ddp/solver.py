@@ -45,6 +45,7 @@ class _Batch(ctypes.Structure):
         ("x0", c_void_p),
         ("theta", c_void_p),
         ("u0", c_void_p),
+        ("theta_stride", c_int64),
         ("x", c_void_p),
         ("u", c_void_p),
         ("J", c_void_p),
@@ -160,11 +161,11 @@ class DDPSolver(Solver):
             "J": (n,),
             "predicted": (n,),
             "x0": (n, mpc.nx),
-            "theta": (n, theta.shape[-1]),
             "u0": (n, mpc.nu),
         }
         block, address = _block(shapes)
-        block["x0"][:], block["theta"][:] = x, theta
+        block["x0"][:] = x
+        theta = np.ascontiguousarray(theta)  # one for all, or a row a problem
         if u0 is None:
             address["u0"] = None
         else:
@@ -173,7 +174,14 @@ class DDPSolver(Solver):
             block["x"][:], block["u"][:] = plan
         counts = np.empty((2, n), np.int64)
         where = counts.ctypes.data
-        batch = _Batch(n=n, iterations=where, status=where + counts.strides[0], **address)
+        batch = _Batch(
+            n=n,
+            theta=theta.ctypes.data,
+            theta_stride=theta.shape[1] if theta.ndim == 2 else 0,
+            iterations=where,
+            status=where + counts.strides[0],
+            **address,
+        )
         failed = self._call(batch, cold=plan is None)
         if failed:
             raise MemoryError(f"solving {n} MPCs: the kernel could not allocate its work space")

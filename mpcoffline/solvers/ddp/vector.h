@@ -12,6 +12,8 @@
 typedef double vd __attribute__((vector_size(8 * LANES)));
 typedef long long vl __attribute__((vector_size(8 * LANES)));
 
+#define NOINLINE __attribute__((noinline))
+
 static inline vd V(double a) { return a - (vd){0}; }
 static inline vd vd_select(vl mask, vd a, vd b) { return (vd)((mask & (vl)a) | (~mask & (vl)b)); }
 static inline vl vd_lt(vd a, vd b) { return a < b; }
