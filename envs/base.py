@@ -1,18 +1,22 @@
-"""What the tasks share: float64 physics behind a float32 observation, cost in ``info``, checked input."""
+"""What the tasks share: float64 physics behind a float32 observation, noise, cost in ``info``, checked input."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from .arguments import Array, Start, checked_deviations, checked_render_mode, checked_start, checked_state
+from .rendering import Canvas, Frame, Moment, Viewer
+
 Observation = NDArray[np.float32]
+
+SUCCESS_ANGLE = 0.3  # rad from upright, of both swing-ups
 
 
 def rk4(derivative: Callable[[Array, Array], Array], state: Array, action: Array, dt: float) -> Array:
@@ -42,37 +46,86 @@ def wrap_angle(angle: Array) -> Array:
 
 
 class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
-    """A deterministic control task with state s, observation y(s) and stage cost L(s, a); reward = -L.
+    r"""A control task with state s, observation y(s) and stage cost L(s, a); reward = -L.
 
     A task states its plant and its cost as four functions of arrays with any leading dimensions
-    (:meth:`next_state`, :meth:`cost`, :meth:`observe`, :meth:`is_success`) and how an episode starts
-    (:meth:`sample_state`); this class turns them into a Gymnasium environment.
+    (:meth:`next_state`, :meth:`cost`, :meth:`observe`, :meth:`is_success`), how an episode starts
+    (:meth:`sample_state`) and what it looks like (:meth:`draw`); this class turns them into a Gymnasium environment.
 
     The simulation runs in float64. Every ``info`` carries ``"cost"`` (the cost L(s_k, a_k) of the step just taken as
     float64; 0 at reset), ``"state"`` (the state s reached, float64) and ``"is_success"``. A task never
-    terminates: the time limit truncates it, so that a learner bootstraps from the last observation.
+    terminates: the time limit truncates it, so that a learner bootstraps from the last observation. A state that would
+    leave :attr:`state_limit` (no episode of 100 steps of the default plant does) stays at the limit, so that
+    observations keep their bounds in episodes of any length.
 
-    ``reset(options=...)`` knows ``{"state": s}`` (start there) and ``{"start": name}`` with a name out of
-    :attr:`starts`.
+    **Noise**, both Gaussian, independent between steps and coordinates, off by default::
+
+        s+ = f(s, a) + w     w ~ N(0, diag(process_noise^2))         one draw a step, in the units of s
+        y  = h(s + v)        v ~ N(0, diag(measurement_noise^2))     also at reset; s itself stays as it is
+
+    Process noise moves the plant: ``info["state"]`` and later costs contain it. Measurement noise is in the observation
+    only: ``info["state"]`` and ``info["cost"]`` stay true. It is added to the state's coordinates and not to those of
+    y: what a sensor reads is the angle, in rad, and (cos phi, sin phi) of a noisy angle is still a point on the unit
+    circle, where models of y hold and within the observation bounds. Noise has a stream of random numbers of its own,
+    spawned from ``np_random`` by ``reset(seed=...)``: the same seed gives the same starts with and without noise.
+
+    ``reset(options=...)`` knows ``{"state": s}`` (start there), ``{"start": name}`` with a name out of
+    :attr:`starts`, and ``{"low": l, "high": h}`` (uniform between them; scalars or ``(nx,)``; an angle's bounds may
+    reach to 2 pi, the draw is wrapped).
+
+    Args:
+        start: Distribution of initial states when ``reset`` is not told otherwise: a name out of :attr:`starts`
+            (the first by default) or bounds ``(low, high)`` as above.
+        process_noise: Standard deviation of w, a scalar or one a coordinate of s.
+        measurement_noise: Standard deviation of v, a scalar or one a coordinate of s.
+        render_mode: None, ``"human"`` (a window, redrawn in each step) or ``"rgb_array"`` (``render`` returns a
+            picture).
+
+    Raises:
+        ValueError: For an argument out of its range, of a wrong shape or not finite.
 
     Attributes:
         dt: Sampling time in s.
         state_space: States that ``reset`` accepts.
+        state_limit: Largest absolute values of the state in the simulation, ``(nx,)``; infinite for an angle.
         starts: Names of the initial-state distributions, the default first.
+        angle: The coordinate of s that wraps, None without one.
+        picture_size: Width and height of a picture in pixels.
+        trail_steps: Steps that the trail in a picture goes back.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 -- declared so by gymnasium.Env
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012 -- gymnasium's
     dt: ClassVar[float]
     starts: ClassVar[tuple[str, ...]] = ("broad",)
+    angle: ClassVar[int | None] = None
+    picture_size: ClassVar[tuple[int, int]] = (600, 600)
+    trail_steps: ClassVar[int] = 30
 
     action_space: spaces.Box
     observation_space: spaces.Box
     state_space: spaces.Box
+    state_limit: Array
     _state: Array | None = None
+    _noise_generator: np.random.Generator | None = None
+
+    def __init__(
+        self,
+        *,
+        start: Start | None = None,
+        process_noise: ArrayLike = 0.0,
+        measurement_noise: ArrayLike = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        nx = self.state_space.shape[0]
+        self.start = self._checked_start("start", self.starts[0] if start is None else start)
+        self.process_noise = checked_deviations("process_noise", process_noise, nx)
+        self.measurement_noise = checked_deviations("measurement_noise", measurement_noise, nx)
+        self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
+        self._viewer = None if render_mode is None else self.new_viewer(render_mode)
 
     @abstractmethod
     def next_state(self, state: Array, action: Array) -> Array:
-        """The plant: s+ for s ``(..., nx)`` and a ``(..., nu)`` within bounds."""
+        """The plant without noise: f(s, a) for s ``(..., nx)`` and a ``(..., nu)`` within bounds."""
 
     @abstractmethod
     def cost(self, state: Array, action: Array) -> Array:
@@ -80,7 +133,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
 
     @abstractmethod
     def observe(self, state: Array) -> Observation:
-        """The observation y(s), ``(..., ny)`` float32; smooth where s wraps."""
+        """The observation h(s) without noise, ``(..., ny)`` float32; smooth where s wraps."""
 
     @abstractmethod
     def is_success(self, state: Array) -> NDArray[np.bool_]:
@@ -90,6 +143,30 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     def sample_state(self, start: str) -> Array:
         """Draws an initial state ``(nx,)`` of the named distribution from ``self.np_random``."""
 
+    @abstractmethod
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draws the plant, its reference, the action and the trail."""
+
+    @property
+    def noisy(self) -> bool:
+        """Whether there is process or measurement noise."""
+        return bool(self.process_noise.any() or self.measurement_noise.any())
+
+    def confined(self, state: Array) -> Array:
+        """The state ``(..., nx)`` within :attr:`state_limit`, its angle wrapped to (-pi, pi]."""
+        inside = np.minimum(np.maximum(state, -self.state_limit), self.state_limit)
+        if self.angle is not None:
+            inside[..., self.angle] = wrap_angle(inside[..., self.angle])
+        return inside
+
+    def disturbed(self, state: Array, normal: Array) -> Array:
+        """The state with process noise from standard normal numbers, both ``(..., nx)``."""
+        return self.confined(state + self.process_noise * normal)
+
+    def measured(self, state: Array, normal: Array) -> Observation:
+        """The observation with measurement noise from standard normal numbers ``(..., nx)``."""
+        return self.observe(self.confined(state + self.measurement_noise * normal))
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -97,19 +174,25 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
 
         Args:
             seed: Seeds the environment's random numbers.
-            options: ``{"state": s}`` or ``{"start": name}``; see the class.
+            options: ``{"state": s}``, ``{"start": name}`` or ``{"low": l, "high": h}``; see the class.
 
         Returns:
             The first observation and its info.
 
         Raises:
-            ValueError: For an unknown option, or a state of the wrong shape, not finite or out of range.
+            ValueError: For an unknown option, or a state or bound of the wrong shape, not finite or out of range.
         """
         super().reset(seed=seed)
+        if seed is not None:
+            self._noise_generator = None
         self._state = self.initial_state(options or {})
-        return self.observe(self._state), self._info(self._state, 0.0)
+        observation = self.measured(self._state, self._normals()[1]) if self.noisy else self.observe(self._state)
+        if self._viewer is not None:
+            self._viewer.begin(self._state)
+        self._show()
+        return observation, self._info(self._state, 0.0)
 
-    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[Any]) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Applies an action for one sampling time; an action beyond the bounds is clipped to them.
 
         Raises:
@@ -121,10 +204,42 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         applied = self.checked_action(action, self.action_space.shape)
         cost = float(self.cost(self._state, applied))
         self._state = self.next_state(self._state, applied)
-        return self.observe(self._state), -cost, False, False, self._info(self._state, cost)
+        if self.noisy:
+            process, measurement = self._normals()
+            self._state = self.disturbed(self._state, process)
+            observation = self.measured(self._state, measurement)
+        else:
+            observation = self.observe(self._state)
+        if self._viewer is not None:
+            self._viewer.add(self._state, applied, cost)
+        self._show()
+        return observation, -cost, False, False, self._info(self._state, cost)
 
-    def _info(self, state: Array, cost: float) -> dict[str, Any]:
-        return {"cost": cost, "state": state.copy(), "is_success": bool(self.is_success(state))}
+    def render(self) -> Frame | None:
+        """The picture ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``; None otherwise.
+
+        Raises:
+            gymnasium.error.ResetNeeded: Before the first ``reset``.
+            gymnasium.error.DependencyNotInstalled: Without pygame.
+        """
+        if self._viewer is None:
+            gym.logger.warn(
+                "render: expected an environment made with a render_mode, which this one was not: nothing is drawn. "
+                f"Make it with one of {self.metadata['render_modes']}, e.g. gym.make(..., render_mode='rgb_array')."
+            )
+            return None
+        if self._state is None:
+            raise gym.error.ResetNeeded("render: expected a reset environment, call reset() first.")
+        return self._viewer.render()
+
+    def close(self) -> None:
+        """Closes the window, if there is one; can be repeated."""
+        if self._viewer is not None:
+            self._viewer.close()
+
+    def new_viewer(self, render_mode: str) -> Viewer:
+        """What draws this task's episodes."""
+        return Viewer(self.draw, self.picture_size, self.trail_steps, self.dt, render_mode)
 
     def checked_action(self, action: NDArray[Any], shape: tuple[int, ...]) -> Array:
         """The action in float64, clipped to the bounds; refused when of another shape or not finite."""
@@ -138,28 +253,39 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
 
     def initial_state(self, options: dict[str, Any]) -> Array:
         """The state ``(nx,)`` that ``reset(options=...)`` starts from."""
-        unknown = set(options) - {"state", "start"}
-        if unknown or len(options) > 1:
+        given = set(options)
+        if given == {"state"}:
+            return checked_state("reset option 'state'", options["state"], self.state_space)
+        if given == {"low", "high"}:
+            start = self._checked_start("reset options 'low', 'high'", (options["low"], options["high"]))
+        elif given == {"start"}:
+            start = self._checked_start("reset option 'start'", options["start"])
+        elif not given:
+            start = self.start
+        else:
             raise ValueError(
-                f"reset options: expected at most one of 'state' and 'start', got {sorted(map(str, options))}."
+                "reset options: expected at most one of 'low' with 'high', 'state' and 'start', "
+                f"got {sorted(map(str, options))}."
             )
-        if "state" in options:
-            return self._checked_state(options["state"])
-        start = options.get("start", self.starts[0])
-        if start not in self.starts:
-            raise ValueError(f"reset option 'start': expected one of {self.starts}, got {start!r}.")
-        return self.sample_state(start)
+        if isinstance(start, str):
+            return self.sample_state(start)
+        return self.confined(self.np_random.uniform(*start))
 
-    def _checked_state(self, state: object) -> Array:
-        space = self.state_space
-        array = np.array(state, dtype=np.float64)
-        if array.shape != space.shape:
-            raise ValueError(f"reset option 'state': expected shape {space.shape}, got {array.shape}.")
-        if not (np.isfinite(array).all() and (array >= space.low).all() and (array <= space.high).all()):
-            raise ValueError(
-                f"reset option 'state': expected finite values from {space.low} to {space.high}, got {array}."
-            )
-        return array
+    def _checked_start(self, name: str, start: Start) -> str | tuple[Array, Array]:
+        return checked_start(name, start, self.starts, self.state_space, self.angle)
+
+    def _normals(self) -> Array:
+        """Standard normal numbers of one observation: those of w and of v, ``(2, nx)``."""
+        if self._noise_generator is None:
+            self._noise_generator = self.np_random.spawn(1)[0]
+        return self._noise_generator.standard_normal((2, len(self.process_noise)))
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
+
+    def _info(self, state: Array, cost: float) -> dict[str, Any]:
+        return {"cost": cost, "state": state.copy(), "is_success": bool(self.is_success(state))}
 
 
 def float32_box(low: list[float] | Array, high: list[float] | Array) -> spaces.Box:

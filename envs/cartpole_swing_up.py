@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .base import Array, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from . import rendering as style
+from .arguments import Array, Start, checked_number
+from .base import SUCCESS_ANGLE, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from .rendering import Canvas, Moment, clockwise, refined, signed
 from .vector import ControlTaskVectorEnv
 
 GRAVITY = 9.8
@@ -19,82 +22,155 @@ MAX_CART_SPEED = 200.0
 MAX_POLE_SPEED = 500.0
 # Starts from which no input leaves the observation bounds, and from which RK4 at this sampling time is stable.
 MAX_START = (100.0, 20.0, np.pi, 20.0)
+# RK4 is stable for the cart's friction up to about 2.8 / dt; here with a margin.
+MAX_FRICTION_RATE = 40.0
 
 
 class CartPoleSwingUpEnv(ControlTask):
     r"""Swing up the pole of a cart with viscous friction, and bring the cart back to the middle.
 
-    ## Dynamics
-    The cart-pole with half-length $l = 0.5$ m, $m_c = m_p = 0.2$ kg, friction $\mu = 0.5$ N s/m, $M = m_c + m_p$,
-    $\varphi = 0$ upright:
+    ## Description
+    A uniform pole is hinged on a cart that a force moves along a track without end. The force swings the pole up and
+    keeps it upright, which is unstable, while the cart returns to the middle of the track. With the pole's half-length
+    $l$, the masses $m_c$ and $m_p$, $M = m_c + m_p$ and the friction $\mu$ of the cart:
 
-    $\ddot\varphi = \dfrac{g\sin\varphi + \cos\varphi\,(\mu\dot x - u - m_p l\dot\varphi^2\sin\varphi)/M}
-    {l\,(4/3 - m_p\cos^2\varphi/M)}$,
-    $\quad\ddot x = \dfrac{u - \mu\dot x + m_p l(\dot\varphi^2\sin\varphi - \ddot\varphi\cos\varphi)}{M}$
+    $$\ddot\varphi = \dfrac{g\sin\varphi + \cos\varphi\,(\mu\dot x - u - m_p l\dot\varphi^2\sin\varphi)/M}
+    {l\,(4/3 - m_p\cos^2\varphi/M)}, \qquad
+    \ddot x = \dfrac{u - \mu\dot x + m_p l(\dot\varphi^2\sin\varphi - \ddot\varphi\cos\varphi)}{M}$$
 
-    integrated with one Runge-Kutta (RK4) step of 0.05 s, the force held. The track has no end.
+    with $\varphi = 0$ upright and positive clockwise in the picture; integrated with one Runge-Kutta (RK4) step of
+    $dt = 0.05$ s, the force held.
 
-    ## Action space
-    `Box(-2, 2, (1,), float32)`
+    ## Action Space
+    `Box(-2.0, 2.0, (1,), float32)`. An action beyond the bounds is clipped to them.
 
-    | Index | Action  | Min | Max | Unit |
-    |-------|---------|-----|-----|------|
-    | 0     | force u | -2  | 2   | N    |
+    | Num | Action                             | Min  | Max | Unit |
+    |-----|------------------------------------|------|-----|------|
+    | 0   | force $u$ on the cart, to the right | -2.0 | 2.0 | N    |
 
-    ## Observation space
-    `Box([-1000, -200, -1, -1, -500], [1000, 200, 1, 1, 500], (5,), float32)`, wide enough for any reachable state.
+    ## Observation Space
+    `Box([-1000, -200, -1, -1, -500], [1000, 200, 1, 1, 500], (5,), float32)`. The bounds hold for any state that 100
+    steps of the default plant can reach from `state_space`; in longer episodes position and speeds saturate at them.
 
-    | Index | Observation | Unit  |
-    |-------|-------------|-------|
-    | 0     | x           | m     |
-    | 1     | xd          | m/s   |
-    | 2     | cos(phi)    |       |
-    | 3     | sin(phi)    |       |
-    | 4     | phid        | rad/s |
+    | Num | Observation    | Min     | Max    | Unit  |
+    |-----|----------------|---------|--------|-------|
+    | 0   | $x$            | -1000.0 | 1000.0 | m     |
+    | 1   | $\dot x$       | -200.0  | 200.0  | m/s   |
+    | 2   | $\cos\varphi$  | -1.0    | 1.0    |       |
+    | 3   | $\sin\varphi$  | -1.0    | 1.0    |       |
+    | 4   | $\dot\varphi$  | -500.0  | 500.0  | rad/s |
 
-    The state $s = [x, \dot x, \varphi, \dot\varphi]$, $\varphi$ wrapped to $(-\pi, \pi]$, is in `info["state"]`.
+    ## State Space
+    The state $s = [x, \dot x, \varphi, \dot\varphi]$ is in `info["state"]`; `state_space`, a `Box(float64)`, holds
+    the states that `reset` accepts.
 
-    ## Reward
-    $-L$ with $L = 2x^2 + \varphi^2 + 0.1\dot x^2 + 0.1\dot\varphi^2 + 0.1u^2$.
+    | Num | State                              | Min    | Max   | Unit  |
+    |-----|------------------------------------|--------|-------|-------|
+    | 0   | $x$                                | -100.0 | 100.0 | m     |
+    | 1   | $\dot x$                           | -20.0  | 20.0  | m/s   |
+    | 2   | $\varphi$, wrapped to $(-\pi,\pi]$ | $-\pi$ | $\pi$ | rad   |
+    | 3   | $\dot\varphi$                      | -20.0  | 20.0  | rad/s |
 
-    ## Start, end, success
-    `options={"start": "broad"}` (default): $x \sim U(-1, 1)$, $\dot x \sim U(-0.5, 0.5)$, $\varphi \sim U(-\pi, \pi)$,
-    $\dot\varphi \sim U(-1, 1)$; `"hanging"`: $\varphi = \pi + U(-0.2, 0.2)$, the rest $U(-0.1, 0.1)$. Never terminates;
-    truncated after 100 steps. Success: $|\varphi| < 0.3$. `options={"state": s}` takes $|x| \le 100$ m,
-    $|\dot x| \le 20$ m/s, $|\dot\varphi| \le 20$ rad/s.
+    ## Rewards
+    $r = -L(s, u)$ with the stage cost
+
+    $$L = 2x^2 + \varphi^2 + 0.1\dot x^2 + 0.1\dot\varphi^2 + 0.1u^2$$
+
+    of the state before the step. The best reward of a step is 0.
+
+    ## Starting State
+    | `start`             | $x$            | $\dot x$       | $\varphi$             | $\dot\varphi$  |
+    |---------------------|----------------|----------------|-----------------------|----------------|
+    | `"broad"` (default) | $U(-1, 1)$     | $U(-0.5, 0.5)$ | $U(-\pi, \pi)$        | $U(-1, 1)$     |
+    | `"hanging"`         | $U(-0.1, 0.1)$ | $U(-0.1, 0.1)$ | $\pi + U(-0.2, 0.2)$  | $U(-0.1, 0.1)$ |
+
+    `reset(options=...)` takes one of `{"start": name}`, `{"state": s}` (start at $s$) and `{"low": l, "high": h}`
+    (uniform between two states or scalars; the bounds of $\varphi$ may reach to $\pm 2\pi$, the draw is wrapped).
+
+    ## Episode End
+    1. Termination: never.
+    2. Truncation: after 100 steps (5 s); `gym.make(..., max_episode_steps=...)` sets another length.
+
+    The episode is a success if $|\varphi| < 0.3$ at its end.
+
+    ## Arguments
+    `gym.make("mpcoffline/CartPoleSwingUp-v0", mu=0.4, measurement_noise=[0.01, 0.05, 0.01, 0.05])`. Lists instead of
+    arrays keep `env.spec` storable as JSON.
+
+    | Argument            | Type             | Default   | Meaning and range                                    |
+    |---------------------|------------------|-----------|------------------------------------------------------|
+    | `m_c`               | float            | 0.2       | mass of the cart, 0.01 to 100 kg                     |
+    | `m_p`               | float            | 0.2       | mass of the pole, 0.01 to 100 kg                     |
+    | `l`                 | float            | 0.5       | half the length of the pole, 0.05 to 20 m            |
+    | `mu`                | float            | 0.5       | friction of the cart, 0 to $40(m_c + m_p/4)$ N s/m   |
+    | `g`                 | float            | 9.8       | gravity, 0 to 30 m/s²                                |
+    | `start`             | str, (low, high) | `"broad"` | starting states: a name, or bounds                   |
+    | `process_noise`     | float, list      | 0.0       | std of noise $w$, one or one a state: $s_+ + w$      |
+    | `measurement_noise` | float, list      | 0.0       | std of noise $v$, one or one a state: $y = h(s + v)$ |
+    | `render_mode`       | str              | None      | `"human"` (a window), `"rgb_array"` (pictures)       |
+
+    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
+
+    ## Info
+    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
+    just taken, 0 at reset) and `info["is_success"]` (bool).
+
+    ## Version History
+    * v0: first release.
 
     ## References
-    Sawant, Anand, Reinhardt, Gros, arXiv:2301.01667; Barto, Sutton, Anderson (1983) for the equations.
-
-    ## Version history
-    * v0: first release.
+    Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.
+    Barto, Sutton, Anderson, "Neuronlike adaptive elements that can solve difficult learning control problems", IEEE
+    Transactions on Systems, Man, and Cybernetics, 1983, for the equations.
     """
 
     dt = 0.05
     starts = ("broad", "hanging")
+    angle = 2
+    picture_size = (600, 400)
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        *,
+        m_c: float = CART_MASS,
+        m_p: float = POLE_MASS,
+        l: float = HALF_LENGTH,  # noqa: E741 -- the plant's own name
+        mu: float = FRICTION,
+        g: float = GRAVITY,
+        start: Start = "broad",
+        process_noise: ArrayLike = 0.0,
+        measurement_noise: ArrayLike = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        self.m_c = checked_number("m_c", m_c, 0.01, 100.0, "kg")
+        self.m_p = checked_number("m_p", m_p, 0.01, 100.0, "kg")
+        self.l = checked_number("l", l, 0.05, 20.0, "m")
+        # The mass that the force meets is least with the pole upright or hanging: m_c + m_p / 4.
+        self.mu = checked_number("mu", mu, 0.0, MAX_FRICTION_RATE * (self.m_c + self.m_p / 4.0), "N s/m")
+        self.g = checked_number("g", g, 0.0, 30.0, "m/s^2")
         self.action_space = float32_box([-MAX_FORCE], [MAX_FORCE])
         bounds = np.array([MAX_POSITION, MAX_CART_SPEED, 1.0, 1.0, MAX_POLE_SPEED])
         self.observation_space = float32_box(-bounds, bounds)
         self.state_space = float64_box(list(MAX_START))
+        self.state_limit = np.array([MAX_POSITION, MAX_CART_SPEED, np.inf, MAX_POLE_SPEED])
+        super().__init__(
+            start=start, process_noise=process_noise, measurement_noise=measurement_noise, render_mode=render_mode
+        )
 
     def derivative(self, state: Array, action: Array) -> Array:
         """The equations of motion: d[x, xd, phi, phid]/dt, ``(..., 4)``."""
         xd, phi, phid = state[..., 1], state[..., 2], state[..., 3]
         u, sin, cos = action[..., 0], np.sin(phi), np.cos(phi)
-        mass, moment = CART_MASS + POLE_MASS, POLE_MASS * HALF_LENGTH
-        drive = FRICTION * xd - u - moment * np.square(phid) * sin
-        inertia = HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * np.square(cos) / mass)
-        phidd = (GRAVITY * sin + cos * drive / mass) / inertia
-        xdd = (u - FRICTION * xd + moment * (np.square(phid) * sin - phidd * cos)) / mass
+        mass, moment = self.m_c + self.m_p, self.m_p * self.l
+        drive = self.mu * xd - u - moment * np.square(phid) * sin
+        inertia = self.l * (4.0 / 3.0 - self.m_p * np.square(cos) / mass)
+        phidd = (self.g * sin + cos * drive / mass) / inertia
+        xdd = (u - self.mu * xd + moment * (np.square(phid) * sin - phidd * cos)) / mass
         return np.stack([xd, xdd, phid, phidd], axis=-1)
 
     def next_state(self, state: Array, action: Array) -> Array:
-        """The plant: one RK4 step, then the angle wrapped."""
-        reached = rk4(self.derivative, state, action, self.dt)
-        reached[..., 2] = wrap_angle(reached[..., 2])
-        return reached
+        """The plant without noise: one RK4 step, then the angle wrapped."""
+        return self.confined(rk4(self.derivative, state, action, self.dt))
 
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost 2 x^2 + phi^2 + 0.1 xd^2 + 0.1 phid^2 + 0.1 u^2."""
@@ -114,7 +190,7 @@ class CartPoleSwingUpEnv(ControlTask):
 
     def is_success(self, state: Array) -> NDArray[np.bool_]:
         """Whether the pole is within 0.3 rad of upright."""
-        return np.asarray(np.abs(state[..., 2]) < 0.3)
+        return np.asarray(np.abs(state[..., 2]) < SUCCESS_ANGLE)
 
     def sample_state(self, start: str) -> Array:
         """Draws [x, xd, phi, phid]; see the class."""
@@ -124,6 +200,40 @@ class CartPoleSwingUpEnv(ControlTask):
             state[2] = wrap_angle(state[2])
             return state
         return rng.uniform([-1.0, -0.5, -np.pi, -1.0], [1.0, 0.5, np.pi, 1.0])
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draws cart and pole on the track, the way of the tip, the zone of success, the reference and the force."""
+        track, axis = 206.0, canvas.height - 44.0
+        # A view of 4.8 m, more for long poles, that follows a cart near its edges.
+        scale = min(canvas.width / 4.8, 125.0 / (2.0 * self.l))
+        half = canvas.width / 2.0 / scale
+        x, phi = float(moment.state[0]), float(moment.state[2])
+        center = x - np.clip(x, -0.55 * half, 0.55 * half)
+
+        def place(position: ArrayLike, height: ArrayLike = 0.0) -> Array:
+            across = canvas.width / 2.0 + (np.asarray(position) - center) * scale
+            return np.stack(np.broadcast_arrays(across, track - np.asarray(height) * scale), axis=-1)
+
+        canvas.ruler(axis, center - half, center + half)
+        middle = float(place(0.0)[0])
+        canvas.dashed([middle, track], [middle, axis], 2.0, style.TARGET)
+        # Out of the view, the mark stays at the edge and points there.
+        canvas.marker([float(np.clip(middle, 12.0, canvas.width - 12.0)), axis - 9.0], middle, style.TARGET)
+        canvas.line([0.0, track], [canvas.width, track], 4.0, style.PALE)
+        hinge, reach = place(x), 2.0 * self.l * scale
+        canvas.wedge(hinge, reach + 22.0, -SUCCESS_ANGLE, SUCCESS_ANGLE, style.TARGET_ZONE)
+        trail = refined(moment.trail, self.angle)
+        canvas.trail(place(trail[:, 0]) + reach * clockwise(trail[:, 2]), 5.0, style.TRAIL)
+        canvas.box(hinge, 66.0, 34.0, style.INK)
+        canvas.line(hinge, hinge + reach * clockwise(phi), 11.0, style.PLANT, rounded=True)
+        canvas.disc(hinge, 3.5, style.WHITE)
+        caption = [(f"t = {moment.time:.2f} s", style.INK), (f"cost {moment.cost:.2f}", style.INK)]
+        if moment.action is not None:
+            force = float(moment.action[0])
+            side = hinge + np.array([np.copysign(38.0, force), 0.0])
+            canvas.arrow(side, side + np.array([80.0 * force / MAX_FORCE, 0.0]), 6.0, style.INPUT)
+            caption.append((f"force {signed(force)} N", style.INPUT))
+        canvas.caption(caption)
 
 
 class CartPoleSwingUpVectorEnv(ControlTaskVectorEnv):

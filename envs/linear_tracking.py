@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import functools
+import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .base import Array, ControlTask, Observation, float32_box, float64_box
+from . import rendering as style
+from .arguments import Array, Start, checked_matrix, checked_number
+from .base import ControlTask, Observation, float32_box, float64_box
+from .rendering import Canvas, Moment, refined, signed
 from .vector import ControlTaskVectorEnv
 
 A0 = np.array([[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.9, 0.0], [0.0, 0.0, 0.0, 0.9]])
@@ -29,63 +34,126 @@ MAX_FORCE = 10.0
 # Twice what the plant can reach in 100 steps from a start in the box with any admissible input, at the largest alpha.
 MAX_STATE = 1e4
 MAX_ALPHA = 4.0
+SUCCESS_RADIUS = 0.05
 
 
 class LinearTrackingEnv(ControlTask):
     r"""Drive a point mass to the origin of the plane although its dynamics are not the nominal ones.
 
-    ## Dynamics
-    $s_+ = (A_0 + \alpha\,\Delta_A)\,s + (B_0 + \alpha\,\Delta_B)\,a$, sampled every 0.1 s. A controller that knows
-    only $A_0, B_0$ meets a model error that grows with $\alpha$; from about $\alpha = 0.2$ the plant is unstable.
+    ## Description
+    A mass slides on a plane with friction; two forces bring it to the origin. A controller that knows only the nominal
+    matrices $A_0, B_0$ meets a model error that grows with $\alpha$:
 
-    ## Action space
-    `Box(-10, 10, (2,), float32)`
+    $$s_+ = A s + B a, \qquad A = A_0 + \alpha\,\Delta_A, \quad B = B_0 + \alpha\,\Delta_B$$
 
-    | Index | Action | Min | Max | Unit |
-    |-------|--------|-----|-----|------|
-    | 0     | Fx     | -10 | 10  | N    |
-    | 1     | Fy     | -10 | 10  | N    |
+    sampled every $dt = 0.1$ s. From about $\alpha = 0.2$ on the plant is unstable.
 
-    ## Observation space
-    `Box(-1e4, 1e4, (4,), float32)`; the state $s$ (`info["state"]`) is the same in float64.
+    ## Action Space
+    `Box(-10.0, 10.0, (2,), float32)`. An action beyond the bounds is clipped to them.
 
-    | Index | Observation | Unit |
-    |-------|-------------|------|
-    | 0, 1  | x, y        | m    |
-    | 2, 3  | xd, yd      | m/s  |
+    | Num | Action      | Min   | Max  | Unit |
+    |-----|-------------|-------|------|------|
+    | 0   | force $F_x$ | -10.0 | 10.0 | N    |
+    | 1   | force $F_y$ | -10.0 | 10.0 | N    |
 
-    ## Reward
-    $-L$ with $L = 9(x^2 + y^2) + \dot x^2 + \dot y^2 + 0.1(F_x^2 + F_y^2)$.
+    ## Observation Space
+    `Box(-1e4, 1e4, (4,), float32)`. The bounds hold for any state that 100 steps can reach from `state_space`; in
+    longer episodes the state saturates at them.
 
-    ## Start, end, success
-    $s_0 \sim U[-1, 1]^4$. Never terminates; truncated after 100 steps. Success: $|(x, y)| < 0.05$.
-    `options={"state": s}` takes any state from which no input leaves the observation bounds.
+    | Num | Observation | Min  | Max | Unit |
+    |-----|-------------|------|-----|------|
+    | 0   | $x$         | -1e4 | 1e4 | m    |
+    | 1   | $y$         | -1e4 | 1e4 | m    |
+    | 2   | $\dot x$    | -1e4 | 1e4 | m/s  |
+    | 3   | $\dot y$    | -1e4 | 1e4 | m/s  |
+
+    ## State Space
+    The state $s = [x, y, \dot x, \dot y]$ in `info["state"]` is the observation in float64. `state_space`, a
+    `Box(float64)`, holds the states that `reset` accepts: $|s_i| \le b$ with the largest $b$ from which no admissible
+    input leaves the observation bounds in 100 steps (about 580 at $\alpha = 1$).
+
+    ## Rewards
+    $r = -L(s, a)$ with the stage cost
+
+    $$L = 9(x^2 + y^2) + \dot x^2 + \dot y^2 + 0.1(F_x^2 + F_y^2)$$
+
+    of the state before the step. The best reward of a step is 0.
+
+    ## Starting State
+    $s_0 \sim U[-1, 1]^4$, which `start` calls `"broad"`. `reset(options=...)` takes one of `{"start": "broad"}`,
+    `{"state": s}` (start at $s$) and `{"low": l, "high": h}` (uniform between two states or scalars).
+
+    ## Episode End
+    1. Termination: never.
+    2. Truncation: after 100 steps (10 s); `gym.make(..., max_episode_steps=...)` sets another length.
+
+    The episode is a success if $|(x, y)| < 0.05$ at its end.
 
     ## Arguments
-    `alpha` (default 1.0): size of the model error, from 0 to 4.
+    `gym.make("mpcoffline/LinearTracking-v0", alpha=0.5)`. Lists instead of arrays keep `env.spec` storable as JSON.
+
+    | Argument            | Type             | Default    | Meaning and range                                        |
+    |---------------------|------------------|------------|----------------------------------------------------------|
+    | `alpha`             | float            | 1.0        | size of the model error, 0 to 4                          |
+    | `A`                 | 4 x 4 list       | by `alpha` | the plant's matrix, instead; $b \ge 1$ (see State Space) |
+    | `B`                 | 4 x 2 list       | by `alpha` | the plant's input matrix, instead; $b \ge 1$             |
+    | `start`             | str, (low, high) | `"broad"`  | starting states: a name, or bounds                       |
+    | `process_noise`     | float, list      | 0.0        | std of noise $w$, one or one a state: $s_+ + w$          |
+    | `measurement_noise` | float, list      | 0.0        | std of noise $v$, one or one a state: $y = s + v$        |
+    | `render_mode`       | str              | None       | `"human"` (a window), `"rgb_array"` (pictures)           |
+
+    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
+
+    ## Info
+    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
+    just taken, 0 at reset) and `info["is_success"]` (bool).
+
+    ## Version History
+    * v0: first release.
 
     ## References
-    Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning",
-    arXiv:2301.01667. The paper gives no action bounds and no distribution of $s_0$: the ones here are ours.
-
-    ## Version history
-    * v0: first release.
+    Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.
+    The paper gives no action bounds and no distribution of $s_0$: the ones here are ours.
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
     dt = 0.1
+    trail_steps = 100
 
-    def __init__(self, alpha: float = 1.0) -> None:
-        if not 0.0 <= alpha <= MAX_ALPHA:
-            raise ValueError(f"alpha: expected a number from 0 to {MAX_ALPHA}, got {alpha}.")
-        self.alpha = float(alpha)
+    def __init__(
+        self,
+        alpha: float = 1.0,
+        *,
+        A: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        start: Start = "broad",
+        process_noise: ArrayLike = 0.0,
+        measurement_noise: ArrayLike = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        self.alpha = checked_number("alpha", alpha, 0.0, MAX_ALPHA)
         self.A, self.B = plant_matrices(self.alpha)
+        if A is not None:
+            self.A = checked_matrix("A", A, self.A.shape)
+        if B is not None:
+            self.B = checked_matrix("B", B, self.B.shape)
+        bound = start_bound(self.A, self.B)
+        if not bound >= 1.0:
+            raise ValueError(
+                f"A, B: expected a plant that stays within {MAX_STATE:g} for 100 steps from |s| <= 1, "
+                f"got one that does so from |s| <= {bound:.3g} only."
+            )
         self.action_space = float32_box([-MAX_FORCE] * 2, [MAX_FORCE] * 2)
         self.observation_space = float32_box([-MAX_STATE] * 4, [MAX_STATE] * 4)
-        self.state_space = float64_box([start_bound(self.A, self.B)] * 4)
+        self.state_space = float64_box([bound] * 4)
+        self.state_limit = np.full(4, MAX_STATE)
+        super().__init__(
+            start=start, process_noise=process_noise, measurement_noise=measurement_noise, render_mode=render_mode
+        )
 
     def next_state(self, state: Array, action: Array) -> Array:
-        """The plant: A s + B a."""
-        return _product(self.A, state) + _product(self.B, action)
+        """The plant without noise: A s + B a."""
+        return self.confined(_product(self.A, state) + _product(self.B, action))
 
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost s'Ws + a'Ra."""
@@ -100,11 +168,40 @@ class LinearTrackingEnv(ControlTask):
 
     def is_success(self, state: Array) -> NDArray[np.bool_]:
         """Whether the mass is within 0.05 m of the origin."""
-        return np.asarray(np.hypot(state[..., 0], state[..., 1]) < 0.05)
+        return np.asarray(np.hypot(state[..., 0], state[..., 1]) < SUCCESS_RADIUS)
 
     def sample_state(self, start: str) -> Array:
         """Uniform in [-1, 1]^4."""
         return self.np_random.uniform(-1.0, 1.0, size=4)
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draws the plane with the target, and the mass with its way, velocity and force."""
+        x, y, xd, yd = map(float, moment.state)
+        # The view doubles when the mass comes near its edge.
+        half = 1.25 * 2.0 ** max(0, math.ceil(math.log2(max(abs(x), abs(y), 1e-9) / 1.1)))
+        scale = canvas.width / 2.0 / half
+        origin = np.array([canvas.width, canvas.height]) / 2.0
+
+        def place(points: ArrayLike) -> Array:
+            return origin + scale * np.asarray(points) * [1.0, -1.0]
+
+        canvas.grid(origin, scale)
+        canvas.disc(origin, max(SUCCESS_RADIUS * scale, 6.0), style.TARGET_ZONE)
+        canvas.arc(origin, max(SUCCESS_RADIUS * scale, 6.0), 0.0, 2.0 * np.pi, 2.0, style.TARGET)
+        canvas.trail(place(refined(moment.trail, self.angle)[:, :2]), 4.0, style.TRAIL)
+        mass = place([x, y])
+        speed = math.hypot(xd, yd)
+        if speed > 0.0:  # half a second ahead, in the picture at most 110 pixels
+            canvas.arrow(mass, mass + np.array([xd, -yd]) / speed * min(0.5 * speed * scale, 110.0), 4.0, style.PLANT)
+        caption = [(f"t = {moment.time:.1f} s", style.INK), (f"cost {moment.cost:.2f}", style.INK)]
+        if moment.action is not None:
+            force = moment.action
+            pull = force * [1.0, -1.0] / MAX_FORCE
+            rim = mass + 13.0 * pull / max(math.hypot(*pull), 1e-9)
+            canvas.arrow(rim, rim + 110.0 * pull, 6.0, style.INPUT)
+            caption.append((f"force {signed(force[0], 1)}, {signed(force[1], 1)} N", style.INPUT))
+        canvas.disc(mass, 10.0, style.PLANT)
+        canvas.caption(caption)
 
 
 def start_bound(A: Array, B: Array, n_steps: int = 100) -> float:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .base import Array, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from . import rendering as style
+from .arguments import Array, Start, checked_number
+from .base import SUCCESS_ANGLE, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from .rendering import Canvas, Moment, clockwise, refined, signed
 from .vector import ControlTaskVectorEnv
 
 GRAVITY = 9.8
@@ -19,61 +22,125 @@ MAX_START_SPEED = 90.0  # gravity and torque add at most 20.7 rad/s^2, 103.5 rad
 class PendulumSwingUpEnv(ControlTask):
     r"""Swing a rod up with a torque too weak to lift it directly, and hold it upright.
 
-    ## Dynamics
-    $\ddot\varphi = \frac{3g}{2l}\sin\varphi + \frac{3}{m l^2}u$ with $\varphi = 0$ upright,
-    $g = 9.8$ m/s², $m = 1$ kg, $l = 1$ m; integrated with one Runge-Kutta (RK4) step of 0.05 s, the torque held.
+    ## Description
+    A uniform rod hangs from a hinge with a motor. The motor's torque does not hold the rod when it is level, so that
+    the rod has to swing to and fro until it has gathered enough momentum to stand upright, which is unstable.
 
-    ## Action space
-    `Box(-2, 2, (1,), float32)`
+    $$\ddot\varphi = \frac{3g}{2l}\sin\varphi + \frac{3}{m l^2}u$$
 
-    | Index | Action | Min | Max | Unit |
-    |-------|--------|-----|-----|------|
-    | 0     | torque u | -2 | 2 | N m |
+    with $\varphi = 0$ upright and positive clockwise in the picture; integrated with one Runge-Kutta (RK4) step of
+    $dt = 0.05$ s, the torque held. There is no friction.
 
-    ## Observation space
-    `Box([-1, -1, -200], [1, 1, 200], (3,), float32)`. The speed bound holds for any reachable state of an episode.
+    ## Action Space
+    `Box(-2.0, 2.0, (1,), float32)`. An action beyond the bounds is clipped to them.
 
-    | Index | Observation | Unit |
-    |-------|-------------|------|
-    | 0     | cos(phi)    |      |
-    | 1     | sin(phi)    |      |
-    | 2     | phid        | rad/s |
+    | Num | Action     | Min  | Max | Unit |
+    |-----|------------|------|-----|------|
+    | 0   | torque $u$ | -2.0 | 2.0 | N m  |
 
-    The state $s = [\varphi, \dot\varphi]$, $\varphi$ wrapped to $(-\pi, \pi]$, is in `info["state"]`.
+    ## Observation Space
+    `Box([-1, -1, -200], [1, 1, 200], (3,), float32)`. The bound of the speed holds for any state that 100 steps of the
+    default plant can reach from `state_space`; in longer episodes the speed saturates at it.
 
-    ## Reward
-    $-L$ with $L = \varphi^2 + 0.1\dot\varphi^2 + 0.1u^2$.
+    | Num | Observation    | Min    | Max   | Unit  |
+    |-----|----------------|--------|-------|-------|
+    | 0   | $\cos\varphi$  | -1.0   | 1.0   |       |
+    | 1   | $\sin\varphi$  | -1.0   | 1.0   |       |
+    | 2   | $\dot\varphi$  | -200.0 | 200.0 | rad/s |
 
-    ## Start, end, success
-    `options={"start": "broad"}` (default): $\varphi \sim U(-\pi, \pi)$, $\dot\varphi \sim U(-1, 1)$; `"hanging"`:
-    $\varphi = \pi + U(-0.2, 0.2)$, $\dot\varphi \sim U(-0.1, 0.1)$. Never terminates; truncated after 100 steps.
-    Success: $|\varphi| < 0.3$. `options={"state": s}` takes $|\dot\varphi| \le 90$ rad/s.
+    ## State Space
+    The state $s = [\varphi, \dot\varphi]$ is in `info["state"]`; `state_space`, a `Box(float64)`, holds the states that
+    `reset` accepts.
+
+    | Num | State                              | Min    | Max   | Unit  |
+    |-----|------------------------------------|--------|-------|-------|
+    | 0   | $\varphi$, wrapped to $(-\pi,\pi]$ | $-\pi$ | $\pi$ | rad   |
+    | 1   | $\dot\varphi$                      | -90.0  | 90.0  | rad/s |
+
+    ## Rewards
+    $r = -L(s, u)$ with the stage cost
+
+    $$L = \varphi^2 + 0.1\dot\varphi^2 + 0.1u^2$$
+
+    of the state before the step. The best reward of a step is 0.
+
+    ## Starting State
+    | `start`             | $\varphi$               | $\dot\varphi$   |
+    |---------------------|-------------------------|-----------------|
+    | `"broad"` (default) | $U(-\pi, \pi)$          | $U(-1, 1)$      |
+    | `"hanging"`         | $\pi + U(-0.2, 0.2)$    | $U(-0.1, 0.1)$  |
+
+    `reset(options=...)` takes one of `{"start": name}`, `{"state": s}` (start at $s$) and `{"low": l, "high": h}`
+    (uniform between two states or scalars; the bounds of $\varphi$ may reach to $\pm 2\pi$, the draw is wrapped).
+
+    ## Episode End
+    1. Termination: never.
+    2. Truncation: after 100 steps (5 s); `gym.make(..., max_episode_steps=...)` sets another length.
+
+    The episode is a success if $|\varphi| < 0.3$ at its end.
+
+    ## Arguments
+    `gym.make("mpcoffline/PendulumSwingUp-v0", m=1.1, process_noise=[0.0, 0.05])`. Lists instead of arrays keep
+    `env.spec` storable as JSON.
+
+    | Argument            | Type             | Default   | Meaning and range                                    |
+    |---------------------|------------------|-----------|------------------------------------------------------|
+    | `m`                 | float            | 1.0       | mass, 0.01 to 100 kg                                 |
+    | `l`                 | float            | 1.0       | length, 0.05 to 20 m                                 |
+    | `g`                 | float            | 9.8       | gravity, 0 to 30 m/s²                                |
+    | `start`             | str, (low, high) | `"broad"` | starting states: a name, or bounds                   |
+    | `process_noise`     | float, list      | 0.0       | std of noise $w$, one or one a state: $s_+ + w$      |
+    | `measurement_noise` | float, list      | 0.0       | std of noise $v$, one or one a state: $y = h(s + v)$ |
+    | `render_mode`       | str              | None      | `"human"` (a window), `"rgb_array"` (pictures)       |
+
+    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
+
+    ## Info
+    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
+    just taken, 0 at reset) and `info["is_success"]` (bool).
+
+    ## Version History
+    * v0: first release.
 
     ## References
-    Sawant, Anand, Reinhardt, Gros, arXiv:2301.01667; the plant is Gymnasium's `Pendulum` with other constants.
-
-    ## Version history
-    * v0: first release.
+    Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.
+    The plant is that of Gymnasium's `Pendulum` with other constants and a Runge-Kutta step.
     """
 
     dt = 0.05
     starts = ("broad", "hanging")
+    angle = 0
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        *,
+        m: float = MASS,
+        l: float = LENGTH,  # noqa: E741 -- the plant's own name
+        g: float = GRAVITY,
+        start: Start = "broad",
+        process_noise: ArrayLike = 0.0,
+        measurement_noise: ArrayLike = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        self.m = checked_number("m", m, 0.01, 100.0, "kg")
+        self.l = checked_number("l", l, 0.05, 20.0, "m")
+        self.g = checked_number("g", g, 0.0, 30.0, "m/s^2")
         self.action_space = float32_box([-MAX_TORQUE], [MAX_TORQUE])
         self.observation_space = float32_box([-1.0, -1.0, -MAX_SPEED], [1.0, 1.0, MAX_SPEED])
         self.state_space = float64_box([np.pi, MAX_START_SPEED])
+        self.state_limit = np.array([np.inf, MAX_SPEED])
+        super().__init__(
+            start=start, process_noise=process_noise, measurement_noise=measurement_noise, render_mode=render_mode
+        )
 
     def derivative(self, state: Array, action: Array) -> Array:
         """The equation of motion: d[phi, phid]/dt, ``(..., 2)``."""
-        acceleration = 1.5 * GRAVITY / LENGTH * np.sin(state[..., 0]) + 3.0 / (MASS * LENGTH**2) * action[..., 0]
+        acceleration = 1.5 * self.g / self.l * np.sin(state[..., 0]) + 3.0 / (self.m * self.l**2) * action[..., 0]
         return np.stack([state[..., 1], acceleration], axis=-1)
 
     def next_state(self, state: Array, action: Array) -> Array:
-        """The plant: one RK4 step, then the angle wrapped."""
-        reached = rk4(self.derivative, state, action, self.dt)
-        reached[..., 0] = wrap_angle(reached[..., 0])
-        return reached
+        """The plant without noise: one RK4 step, then the angle wrapped."""
+        return self.confined(rk4(self.derivative, state, action, self.dt))
 
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost phi^2 + 0.1 phid^2 + 0.1 u^2."""
@@ -86,7 +153,7 @@ class PendulumSwingUpEnv(ControlTask):
 
     def is_success(self, state: Array) -> NDArray[np.bool_]:
         """Whether the rod is within 0.3 rad of upright."""
-        return np.asarray(np.abs(state[..., 0]) < 0.3)
+        return np.asarray(np.abs(state[..., 0]) < SUCCESS_ANGLE)
 
     def sample_state(self, start: str) -> Array:
         """Draws [phi, phid]; see the class."""
@@ -94,6 +161,25 @@ class PendulumSwingUpEnv(ControlTask):
             angle = wrap_angle(np.pi + self.np_random.uniform(-0.2, 0.2, size=1))[0]
             return np.array([angle, self.np_random.uniform(-0.1, 0.1)])
         return self.np_random.uniform([-np.pi, -1.0], [np.pi, 1.0])
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draws the rod, the way of its tip, the zone of success around upright and the torque."""
+        hinge, reach = np.array([canvas.width / 2, canvas.height / 2 + 14.0]), 215.0
+        canvas.wedge(hinge, reach, -SUCCESS_ANGLE, SUCCESS_ANGLE, style.TARGET_ZONE)
+        canvas.arc(hinge, reach, 0.0, 2.0 * np.pi, 1.5, style.PALE)
+        canvas.dashed(hinge, hinge - np.array([0.0, reach]), 2.0, style.TARGET)
+        canvas.trail(hinge + reach * clockwise(refined(moment.trail, self.angle)[:, 0]), 5.0, style.TRAIL)
+        phi = float(moment.state[0])
+        canvas.line(hinge, hinge + reach * clockwise(phi), 15.0, style.PLANT, rounded=True)
+        canvas.disc(hinge, 13.0, style.INK)
+        canvas.disc(hinge, 5.0, style.WHITE)
+        caption = [(f"t = {moment.time:.2f} s", style.INK), (f"cost {moment.cost:.2f}", style.INK)]
+        if moment.action is not None:
+            torque = float(moment.action[0])
+            edge = phi + np.copysign(0.15, torque)
+            canvas.curved_arrow(hinge, 80.0, edge, 1.4 * torque / MAX_TORQUE, 6.0, style.INPUT)
+            caption.append((f"torque {signed(torque)} N m", style.INPUT))
+        canvas.caption(caption)
 
 
 class PendulumSwingUpVectorEnv(ControlTaskVectorEnv):
