@@ -115,7 +115,7 @@ def test_affine_models_and_full_costs_against_ipopt(seed: int) -> None:
         exact, found = solver.solve(x, u0=imposed), oracle(mpc).solve(x, u0=imposed)
         assert exact.success.all()
         assert (exact.stats["residual"] < 1e-12).all()
-        np.testing.assert_allclose(exact.value, found.value, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(exact.value, found.value, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(exact.u, found.u, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(mpc.model(exact.x[:, :-1], exact.u), exact.x[:, 1:], rtol=1e-10, atol=1e-10)
         costs = [rollout_cost(mpc, *row) for row in zip(x, exact.u, strict=True)]
@@ -137,7 +137,7 @@ def test_active_bounds_against_ipopt(seed: int) -> None:
         assert exact.success.all()
         assert (exact.stats["residual"] < 1e-10).all()
         assert np.abs(exact.u).max() <= 0.4
-        np.testing.assert_allclose(exact.value, found.value, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(exact.value, found.value, rtol=1e-10, atol=1e-10)
         assert (exact.value <= found.value + 1e-9 * (1.0 + np.abs(found.value))).all()
         costs = [rollout_cost(mpc, *row) for row in zip(x, exact.u, strict=True)]
         np.testing.assert_allclose(exact.value, costs, rtol=1e-10, atol=1e-10)
@@ -152,7 +152,7 @@ def test_horizon_100_with_active_bounds(alpha: float) -> None:
     assert "QP" in exact.status
     assert (exact.stats["residual"] < 1e-10).all()
     assert np.abs(exact.u).max() == 10.0
-    np.testing.assert_allclose(exact.value, found.value, rtol=1e-8)
+    np.testing.assert_allclose(exact.value, found.value, rtol=1e-10)
     np.testing.assert_allclose(exact.u0, found.u0, rtol=0, atol=1e-6)
 
 
@@ -175,7 +175,7 @@ def test_one_sided_bounds() -> None:
     exact = LQRSolver(mpc).solve(x)
     assert exact.success.all()
     assert exact.u.min() == -0.1
-    np.testing.assert_allclose(exact.value, oracle(mpc).value(x), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(exact.value, oracle(mpc).value(x), rtol=1e-10, atol=1e-10)
 
 
 def test_warm_starts_change_nothing_but_the_iterations() -> None:
@@ -239,7 +239,7 @@ def test_a_moving_reference_against_ipopt() -> None:
     for imposed in (None, u):
         exact, found = solver.solve(x, theta, imposed), oracle(mpc).solve(x, theta, imposed)
         assert exact.success.all()
-        np.testing.assert_allclose(exact.value, found.value, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(exact.value, found.value, rtol=1e-10, atol=1e-10)
     assert (np.abs(solver.value(x, theta) - solver.value(x)) > 1e-3).all()
 
 
