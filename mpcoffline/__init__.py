@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mpcoffline.mpc import (
         MPC,
         Constraint,
+        ConvexNetworkCost,
+        LiftedCost,
         Model,
         NetworkCost,
         NormCost,
@@ -46,6 +48,8 @@ __version__ = "0.1.0"
 _HOMES = {
     "MPC": "mpc",
     "Constraint": "mpc",
+    "ConvexNetworkCost": "mpc",
+    "LiftedCost": "mpc",
     "Model": "mpc",
     "NetworkCost": "mpc",
     "NormCost": "mpc",
@@ -74,9 +78,11 @@ _HOMES = {
 __all__ = [
     "MPC",
     "Constraint",
+    "ConvexNetworkCost",
     "FileFormatError",
     "InvalidArgumentError",
     "InvalidDataError",
+    "LiftedCost",
     "MPCOfflineError",
     "MPCPolicy",
     "MinariRecorder",

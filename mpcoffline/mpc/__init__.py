@@ -5,8 +5,9 @@ from __future__ import annotations
 from .component import StageCost, TerminalCost
 from .constraints import Constraint, Penalty, StateBounds
 from .cost import NormCost, QuadraticCost
+from .lifted import LiftedCost, polynomial_features
 from .model import Model
-from .networks import NetworkCost
+from .networks import ConvexNetworkCost, NetworkCost
 from .parameters import Block, Parameter, ParameterSpace
 from .problem import MPC
 
@@ -14,6 +15,8 @@ __all__ = [
     "MPC",
     "Block",
     "Constraint",
+    "ConvexNetworkCost",
+    "LiftedCost",
     "Model",
     "NetworkCost",
     "NormCost",
@@ -24,4 +27,5 @@ __all__ = [
     "StageCost",
     "StateBounds",
     "TerminalCost",
+    "polynomial_features",
 ]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import Component, blocks_from_json, difference, vector
-from .networks import NetworkCost
 from .parameters import Array, Block, ParameterSpace
 
 
@@ -70,32 +70,30 @@ class QuadraticCost(Component):
     @property
     def W(self) -> Array:
         """State weight, ``(nx, nx)``."""
-        return self._weights()[: self.nx, : self.nx]
+        return self._weights()[: -self.nu or None, : -self.nu or None]
 
     @property
     def R(self) -> Array:
         """Input weight, ``(nu, nu)``."""
-        return self._weights()[self.nx :, self.nx :]
+        n = len(self.W)
+        return self._weights()[n:, n:]
 
     @property
     def S(self) -> Array:
         """Cross weight, ``(nx, nu)``; zero when it is not a parameter."""
-        return self._weights()[: self.nx, self.nx :]
+        n = len(self.W)
+        return self._weights()[:n, n:]
 
     def _weights(self) -> Array:
         """The matrix H ``(nx + nu, nx + nu)``."""
         values = self.values
         if "H" in values:
             return values["H"]
-        H = np.zeros((self.nx + self.nu,) * 2)
-        H[: self.nx, : self.nx] = values["W"]
-        if "R" in values:
-            H[self.nx :, self.nx :] = values["R"]
-        return H
+        return scipy.linalg.block_diag(values["W"], values["R"]) if "R" in values else values["W"]
 
     def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that e'We = |C'e|^2."""
-        e = difference("x", x, p["x_ref"])
+        e = self._error(x, p)
         if "H" in p:
             return ca.sumsqr(p["H"].T @ ca.vertcat(e, difference("u", u, p["u_ref"]))) + p["constant"]
         cost = ca.sumsqr(p["W"].T @ e) + p["constant"]
@@ -105,11 +103,16 @@ class QuadraticCost(Component):
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """E'We + constant as a CasADi scalar."""
-        factor = p["W"] if "W" in p else p["H"][: self.nx, :]
-        return ca.sumsqr(factor.T @ difference("x", x, p["x_ref"])) + p["constant"]
+        e = self._error(x, p)
+        factor = p["W"] if "W" in p else p["H"][: e.numel(), :]
+        return ca.sumsqr(factor.T @ e) + p["constant"]
+
+    def _error(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """What W weighs: e = x - x_ref."""
+        return difference("x", x, p["x_ref"])
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> QuadraticCost:
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
         """The inverse of :meth:`to_json`."""
         cost = cls.__new__(cls)
         cost.space = blocks_from_json(data)
@@ -162,19 +165,21 @@ class NormCost(Component):
         return cost
 
 
-_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (QuadraticCost, NormCost, NetworkCost)}
-
-
 def cost_from_json(data: Mapping[str, Any]) -> Any:
     """A stage or terminal cost from its JSON form.
 
     Raises:
         FileFormatError: For an unknown kind of cost.
     """
+    from .lifted import LiftedCost  # these two build on this module
+    from .networks import ConvexNetworkCost, NetworkCost
+
+    classes: tuple[Any, ...] = (QuadraticCost, NormCost, NetworkCost, ConvexNetworkCost, LiftedCost)
+    kinds = {each.__name__: each for each in classes}
     kind = data.get("kind")
-    if not isinstance(kind, str) or kind not in _KINDS:
-        raise FileFormatError("cost", expected=f"one of {', '.join(_KINDS)}", actual=repr(kind))
-    return _KINDS[kind].from_json(data)
+    if not isinstance(kind, str) or kind not in kinds:
+        raise FileFormatError("cost", expected=f"one of {', '.join(kinds)}", actual=repr(kind))
+    return kinds[kind].from_json(data)
 
 
 def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 from mpcoffline.errors import InvalidArgumentError
 
 from .component import Component, blocks_from_json, difference, vector
+from .cost import QuadraticCost
 from .parameters import Array, Block, Parameter, ParameterSpace
 
-HIDDEN = (24, 24)  # widths that hold the value of a swing-up to some tenths of a percent
+HIDDEN = (24, 24)  # widths that hold the value of a swing-up to a few percent
+_SMALL = 1e-3  # curvature that a convex network cost has by default besides the network's
 
 
 class NetworkCost(Component):
@@ -27,8 +29,8 @@ class NetworkCost(Component):
         net(z) = A_n h_n + b_n,    h_{k+1} = sigma(A_k h_k + b_k),    h_0 = z,    sigma(a) = a / sqrt(1 + a^2)
 
     By Theorem 1 of Gros & Zanon (doi:10.1109/TAC.2019.2913768) the terminal cost of a learned MPC should be the value
-    function; :func:`mpcoffline.learning.terminal.fit_terminal` distils one into this form, which is small enough for the inner
-    loop of a solver. The network is bounded, so that W decides how the cost grows far away from the data.
+    function. :func:`mpcoffline.learning.terminal.fit_terminal` distils one into this form, which is small enough for
+    the inner loop of a solver. The network is bounded: W decides how the cost grows far away from the data.
 
     All numbers are parameters; those of the normalisation and the reference belong to the group ``"reference"``.
 
@@ -60,24 +62,21 @@ class NetworkCost(Component):
         W: ArrayLike | None = None,
         x_ref: ArrayLike | None = None,
     ) -> None:
-        layers = [Block.free(f"weights_{k}", np.asarray(A, np.float64), "cost") for k, A in enumerate(weights)]
-        shifts = [Block.free(f"biases_{k}", np.asarray(b, np.float64), "cost") for k, b in enumerate(biases)]
-        _check_layers(layers, shifts)
-        self.nx, self.n_layers = layers[0].shape[1], len(layers)
-        nx = self.nx
+        widths = [np.size(b) for b in biases[:-1]]
+        nx = np.shape(weights[0])[-1] if len(weights) and np.ndim(weights[0]) else 0
+        sizes = (nx, *widths, 1)
         weight = np.zeros((nx, nx)) if W is None else np.atleast_2d(np.asarray(W, dtype=np.float64))
         if weight.shape != (nx, nx):
             raise InvalidArgumentError("W", expected=f"shape {(nx, nx)}", actual=f"shape {weight.shape}")
-        smallest = np.finfo(np.float64).tiny
+        self.nx, self.n_layers = nx, len(sizes) - 1
         self.space = ParameterSpace(
             [
-                *layers,
-                *shifts,
+                *_layer_blocks("weights", weights, [(m, n) for n, m in itertools.pairwise(sizes)]),
+                *_layer_blocks("biases", biases, [(m,) for m in sizes[1:]]),
                 Block.free("offset", float(offset), "cost"),
                 Block.psd("W", weight, "cost"),
                 Block.free("scale", float(scale), "reference"),
-                Block.free("mean", vector("mean", mean, nx), "reference"),
-                Block.free("std", Parameter(vector("std", std, nx, 1.0), low=smallest), "reference"),
+                *_normalisation(mean, std, nx),
                 Block.free("x_ref", vector("x_ref", x_ref, nx), "reference"),
             ]
         )
@@ -105,13 +104,120 @@ class NetworkCost(Component):
         return p["offset"] + p["scale"] * signal + ca.sumsqr(ca.mtimes(p["W"].T, x - p["x_ref"]))
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> NetworkCost:
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
         """The inverse of :meth:`to_json`."""
-        space = blocks_from_json(data)
-        values = {block.name: block.value for block in space}
-        weights, biases = _layers(values, "weights"), _layers(values, "biases")
-        cost = cls(weights, biases, mean=values["mean"], std=values["std"], x_ref=values["x_ref"])
-        cost.space = space
+        cost = cls.__new__(cls)
+        cost.space = blocks_from_json(data)
+        cost.nx, cost.n_layers = len(cost.values["mean"]), _n_layers(cost.values, "weights")
+        return cost
+
+
+class ConvexNetworkCost(QuadraticCost):
+    """A stage cost that is an input-convex network in state and input, plus a quadratic cost.
+
+    ::
+
+        Lhat(x, u) = q(x, u) + U_n z_n,      q the quadratic cost of :class:`QuadraticCost`,   U_k >= 0
+        z_{k+1} = sigma(U_k z_k + A_k v + b_k),   z_0 absent,    v = ((x, u) - mean) / std,
+        sigma(a) = (a + sqrt(a^2 + 1)) / 2
+
+    sigma is convex and rises, so that Lhat is convex in (x, u) for every theta (Amos, Xu, Kolter, "Input Convex Neural
+    Networks", arXiv:1609.07152): solvers need no projection, whatever was learned. The network is positive and R keeps
+    the minimum over u unique. As a terminal cost u is held at ``u_ref``; without ``R`` the network sees x alone.
+
+    Args:
+        passes: A_0 ... A_{n-1}, what each layer takes from the inputs; A_k is ``(n_{k+1}, nx + nu)``.
+        biases: b_0 ... b_{n-1}.
+        mixes: U_1 ... U_n, not negative; U_k is ``(n_{k+1}, n_k)``, the last ``(1, n_n)``.
+        W: State weight of q, ``(nx, nx)``.
+        R: Input weight of q, ``(nu, nu)``.
+        mean: Centre of (x, u), ``(nx + nu,)``; zero by default.
+        std: Scale of (x, u), ``(nx + nu,)``, positive; one by default.
+        **options: Further arguments of :class:`QuadraticCost`: ``S``, ``x_ref``, ``u_ref``, ``constant``.
+
+    Raises:
+        InvalidArgumentError: If shapes do not fit, an entry of a U is negative, or [[W, S], [S', R]] is not positive
+            semidefinite.
+    """
+
+    def __init__(
+        self,
+        passes: Sequence[ArrayLike],
+        biases: Sequence[ArrayLike],
+        mixes: Sequence[ArrayLike],
+        W: ArrayLike,
+        R: ArrayLike | None = None,
+        *,
+        mean: ArrayLike | None = None,
+        std: ArrayLike | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(W, R, **options)
+        n = self.nx + self.nu
+        widths = [np.size(b) for b in biases]
+        self.n_layers = len(widths)
+        self.space = ParameterSpace(
+            [
+                *self.space,
+                *_layer_blocks("passes", passes, [(m, n) for m in widths]),
+                *_layer_blocks("biases", biases, [(m,) for m in widths]),
+                *_layer_blocks("mixes", mixes, [(m, k) for k, m in itertools.pairwise((*widths, 1))], low=0.0),
+                *_normalisation(mean, std, n),
+            ]
+        )
+
+    @classmethod
+    def random(
+        cls,
+        nx: int,
+        nu: int,
+        hidden: Sequence[int] = (16, 16),
+        *,
+        seed: int,
+        W: ArrayLike | None = None,
+        R: ArrayLike | None = None,
+        **options: Any,
+    ) -> ConvexNetworkCost:
+        """A cost with random weights.
+
+        Args:
+            nx: Number of states.
+            nu: Number of inputs that the cost depends on.
+            hidden: Widths of the hidden layers, at least one.
+            seed: Seeds the weights.
+            W: State weight of q; 1e-3 on the diagonal by default.
+            R: Input weight of q; likewise.
+            **options: Further arguments of the class.
+        """
+        rng = np.random.default_rng(seed)
+        passes = [rng.normal(size=(m, nx + nu)) / np.sqrt(nx + nu) for m in hidden]
+        biases = [0.5 * rng.normal(size=m) for m in hidden]
+        # Positive weights add up instead of cancelling: each is of the size 1/n, not 1/sqrt(n).
+        mixes = [rng.uniform(0.0, 2.0 / n, size=(m, n)) for n, m in itertools.pairwise((*hidden, 1))]
+        W = _SMALL * np.eye(nx) if W is None else W
+        R = _SMALL * np.eye(nu) if R is None and nu else R
+        return cls(passes, biases, mixes, W, R, **options)
+
+    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """Lhat as a CasADi scalar."""
+        v = (ca.vertcat(x, u if self.nu else ca.SX(0, 1)) - p["mean"]) / p["std"]
+        z = ca.SX(0, 1)
+        for k in range(self.n_layers):
+            a = ca.mtimes(p[f"passes_{k}"], v) + p[f"biases_{k}"]
+            if k > 0:
+                a += ca.mtimes(p[f"mixes_{k - 1}"], z)
+            z = 0.5 * (a + ca.sqrt(a**2 + 1.0))
+        return super().expression(x, u, p) + ca.mtimes(p[f"mixes_{self.n_layers - 1}"], z)
+
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """Lhat(x, u_ref) as a CasADi scalar."""
+        return self.expression(x, p.get("u_ref", ca.SX(0, 1)), p)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """The inverse of :meth:`to_json`."""
+        cost = super().from_json(data)
+        cost.n_layers = _n_layers(cost.values, "passes")
         return cost
 
 
@@ -126,23 +232,24 @@ def random_layers(sizes: Sequence[int], rng: np.random.Generator) -> tuple[list[
     return weights, [0.5 * rng.normal(size=m) for m in sizes[1:]]
 
 
-def _layers(values: Mapping[str, Array], name: str) -> list[Array]:
-    """The matrices or columns of the layers in order."""
-    return [values[f"{name}_{k}"] for k in range(sum(key.startswith(f"{name}_") for key in values))]
+def _layer_blocks(
+    name: str, arrays: Sequence[ArrayLike], shapes: Sequence[tuple[int, ...]], low: float = -np.inf
+) -> list[Block]:
+    """One block a layer, of the shapes that follow from the layers' widths."""
+    if len(arrays) != len(shapes) or not shapes:
+        raise InvalidArgumentError(name, expected=f"{max(len(shapes), 1)} arrays", actual=str(len(arrays)))
+    blocks = [Block.free(f"{name}_{k}", Parameter(array, low), "cost") for k, array in enumerate(arrays)]
+    for block, shape in zip(blocks, shapes, strict=True):
+        if block.shape != shape:
+            raise InvalidArgumentError(block.name, expected=f"shape {shape}", actual=f"shape {block.shape}")
+    return blocks
 
 
-def _check_layers(weights: Sequence[Block], biases: Sequence[Block]) -> None:
-    """Refuses layers that do not follow each other, or that do not end in one number."""
-    if not weights or len(weights) != len(biases):
-        raise InvalidArgumentError(
-            "weights", expected="one matrix a layer, and as many biases", actual=f"{len(weights)} and {len(biases)}"
-        )
-    n_in: int | str = "n"
-    for k, (A, b) in enumerate(zip(weights, biases, strict=True)):
-        rows: int | str = 1 if k == len(weights) - 1 else "m"
-        fits = len(A.shape) == 2 and n_in in ("n", A.shape[1]) and rows in ("m", A.shape[0])
-        if not fits:
-            raise InvalidArgumentError(A.name, expected=f"shape ({rows}, {n_in})", actual=f"shape {A.shape}")
-        if b.shape != A.shape[:1]:
-            raise InvalidArgumentError(b.name, expected=f"shape {A.shape[:1]}", actual=f"shape {b.shape}")
-        n_in = A.shape[0]
+def _normalisation(mean: ArrayLike | None, std: ArrayLike | None, n: int) -> list[Block]:
+    """Centre and scale of n inputs."""
+    positive = Parameter(vector("std", std, n, 1.0), low=np.finfo(np.float64).tiny)
+    return [Block.free("mean", vector("mean", mean, n), "reference"), Block.free("std", positive, "reference")]
+
+
+def _n_layers(values: Mapping[str, Array], name: str) -> int:
+    return sum(key.startswith(f"{name}_") for key in values)
