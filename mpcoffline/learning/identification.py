@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 import scipy.optimize
 import torch
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.torch_twin import TorchTwin
 
 from .checks import check_integers, check_number
 from .coordinates import Coordinates
+from .one_step import OneStep
 
 Array = NDArray[np.float64]
 
@@ -99,50 +98,7 @@ class Identification:
         return float(np.sqrt(np.mean(self.errors_after**2)))
 
 
-class OneStep:
-    """The model's one-step prediction and its derivatives, batched.
-
-    Args:
-        mpc: The MPC whose model it is.
-        parameters: Which coordinates of theta derivatives are taken in, ``(size,)`` booleans.
-    """
-
-    def __init__(self, mpc: MPC, parameters: NDArray[np.bool_]) -> None:
-        f, index = mpc.dynamics_function, np.flatnonzero(parameters)
-        x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", len(parameters))
-        reached = f(x, u, theta)
-        self._shapes = ((mpc.nx,), (mpc.nx, len(index)), (mpc.nx, mpc.nx))
-        parts = [reached, ca.jacobian(reached, theta)[:, index.tolist()].T, ca.jacobian(reached, x).T]
-        self._twins = [
-            TorchTwin(ca.Function("one_step", [x, u, theta], [ca.vertcat(*(ca.vec(ca.densify(y)) for y in parts[:k]))]))
-            for k in (1, 2, 3)
-        ]
-
-    def predict(self, x: Array, u: Array, theta: Array) -> Array:
-        """The prediction f_theta(x, u), ``(B, nx)``."""
-        return self._evaluated(1, x, u, theta)[0]
-
-    def with_slopes(self, x: Array, u: Array, theta: Array) -> tuple[Array, Array]:
-        """The prediction ``(B, nx)`` and df/dtheta over the chosen parameters ``(B, nx, p)``."""
-        predicted, slopes = self._evaluated(2, x, u, theta)
-        return predicted, slopes
-
-    def linearised(self, x: Array, u: Array, theta: Array) -> tuple[Array, Array, Array]:
-        """The prediction, df/dtheta, and df/dx ``(B, nx, nx)``."""
-        predicted, slopes, states = self._evaluated(3, x, u, theta)
-        return predicted, slopes, states
-
-    def _evaluated(self, n_parts: int, x: Array, u: Array, theta: Array) -> list[Array]:
-        columns = [torch.from_numpy(np.ascontiguousarray(v.T)).T for v in (x, u)]  # each entry in one piece of memory
-        with torch.no_grad():
-            flat = self._twins[n_parts - 1](*columns, torch.from_numpy(theta)).numpy()
-        shapes = self._shapes[:n_parts]
-        ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
-        parts = np.split(flat, ends[:-1], axis=1)
-        return [part.reshape(len(x), *shape) for part, shape in zip(parts, shapes, strict=True)]
-
-
-class _Rows(NamedTuple):
+class Rows(NamedTuple):
     """The transitions used, in float64."""
 
     x: Array
@@ -157,7 +113,7 @@ class _Descent(NamedTuple):
     cost: float
 
 
-class _OneStepProblem:
+class OneStepProblem:
     """Normalised one-step prediction errors as a function of the scaled coordinates z of the model parameters.
 
     ::
@@ -165,14 +121,16 @@ class _OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: _Rows) -> None:
+    def __init__(self, mpc: MPC, rows: Rows) -> None:
         self.coordinates = c = Coordinates(mpc, ("model",))
-        self.model = OneStep(mpc, c.mask)
+        self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
+        names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
+        self.names = [names[i] for i in self.free]
         self.rows, self.scale = rows, increments_scale(rows.x, rows.reached)
 
-    def on(self, rows: _Rows) -> _OneStepProblem:
+    def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
         other = copy.copy(self)
         other.rows = rows
@@ -183,6 +141,13 @@ class _OneStepProblem:
         full = np.zeros(self.coordinates.size)
         full[self.free] = z
         return np.asarray(self.coordinates.theta(torch.from_numpy(full)).numpy())
+
+    def z(self, theta: Array) -> Array:
+        """The inverse of :meth:`theta`."""
+        c, chosen = self.coordinates, theta[self.coordinates.mask]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = np.where(c.logarithmic, np.log(chosen / self._theta_0), (chosen - self._theta_0) / c.scale)
+        return np.asarray(np.clip(z[self.free], self.low, self.high))
 
     def slopes(self, z: Array) -> Array:
         """The derivative of theta in z, of the free coordinates."""
@@ -261,28 +226,43 @@ def identify(
     config = config or IdentificationConfig()
     table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
-    problem = _OneStepProblem(mpc, _rows(mpc, table, config, rng))
+    problem = OneStepProblem(mpc, _rows(mpc, table, config, rng))
     rows, unwrapped = _unwrapped(problem.rows, problem.errors(mpc.theta) * problem.scale)
     if unwrapped:
-        problem = _OneStepProblem(mpc, rows)
-    before = _root_mean_square(problem.errors(mpc.theta))
+        problem = OneStepProblem(mpc, rows)
     if not problem.free.size:
-        nothing = np.zeros_like(mpc.theta)
-        return Identification(mpc.theta, nothing, problem.scale, before, before, unwrapped=unwrapped)
+        return described(mpc, problem, np.zeros(0), np.zeros((0, 0)), config.prior_spread, unwrapped)
     z, prior = _best_descent(problem, config, rng)
+    jacobian = problem.linearised(z)[1].reshape(-1, len(z))
+    information = jacobian.T @ jacobian / len(problem.rows.x) / (prior * config.prior_spread**2)
+    return described(mpc, problem, z, information, config.prior_spread, unwrapped)
+
+
+def described(
+    mpc: MPC, problem: OneStepProblem, z: Array, information: Array, spread: float, unwrapped: tuple[int, ...] = ()
+) -> Identification:
+    """What was identified, with errors on the problem's rows; warns of what the user should know.
+
+    Args:
+        mpc: The MPC; its parameters are theta_0.
+        problem: The one-step prediction problem.
+        z: The identified coordinates.
+        information: The data's information about z (the inverse of their covariance without the prior), ``(p, p)``.
+        spread: Standard deviation of the prior.
+        unwrapped: Coordinates that are wrapped angles.
+    """
     theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
-    names = [name for name, chosen in zip(mpc.space.names, problem.coordinates.mask, strict=True) if chosen]
-    covariance, undetermined = _uncertainty(problem, z, prior, [names[i] for i in problem.free])
+    covariance, undetermined = _uncertainty(information, spread, problem.names)
     deviation = np.zeros_like(theta)
     identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
-    deviation[identified] = config.prior_spread * np.sqrt(np.diag(covariance)) * np.abs(problem.slopes(z))
+    deviation[identified] = np.sqrt(np.diag(covariance)) * np.abs(problem.slopes(z))
     result = Identification(
         theta,
         deviation,
         problem.scale,
-        before,
+        _root_mean_square(problem.errors(mpc.theta)),
         _root_mean_square(problem.errors(theta)),
-        tuple(names[i] for i in problem.free[_at_bound(problem, z)]),
+        tuple(name for name, bound in zip(problem.names, _at_bound(problem, z), strict=True) if bound),
         undetermined,
         unwrapped,
     )
@@ -297,17 +277,17 @@ def increments_scale(x: Array, reached: Array) -> Array:
     return np.where(spread > rounding, spread, np.where(rounding > 0.0, x.std(axis=0) + rounding, 1.0))
 
 
-def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> _Rows:
+def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Rows:
     """A random subset in float64, small enough for its Jacobian."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
     count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
     chosen = np.sort(rng.permutation(len(table))[:count])
     columns = table.columns(table.rows[chosen])
     parts = (columns.observations, columns.actions, columns.next_observations)
-    return _Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
+    return Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
 
 
-def _unwrapped(rows: _Rows, errors: Array) -> tuple[_Rows, tuple[int, ...]]:
+def _unwrapped(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
     """S+ with full turns removed in the coordinates that are wrapped angles.
 
     These are confined to one turn, and their prediction errors are either small or near a full turn.
@@ -323,14 +303,14 @@ def _unwrapped(rows: _Rows, errors: Array) -> tuple[_Rows, tuple[int, ...]]:
 
 
 def _best_descent(
-    problem: _OneStepProblem, config: IdentificationConfig, rng: np.random.Generator
+    problem: OneStepProblem, config: IdentificationConfig, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """The minimum and the weight of its prior: found on few rows, refined on all.
 
     It starts again from elsewhere where the first start ends at a bound or explains nothing.
     """
     n, n_coordinates = problem.rows.x.shape
-    few = problem.on(_Rows(*(part[:: max(1, n // _FEW_ROWS)] for part in problem.rows)))
+    few = problem.on(Rows(*(part[:: max(1, n // _FEW_ROWS)] for part in problem.rows)))
 
     def weight(mean_square: float) -> float:
         """What a Gaussian prior weighs against the mean square error: sigma^2 / (n spread^2)."""
@@ -348,16 +328,12 @@ def _best_descent(
     return problem.descend(best.z, prior, config.max_iterations).z, prior
 
 
-def _uncertainty(
-    problem: _OneStepProblem, z: Array, prior: float, names: Sequence[str]
-) -> tuple[Array, tuple[str, ...]]:
-    """Covariance of z in units of the prior's, and the combinations that stay about as uncertain as the prior."""
-    errors, jacobian = problem.linearised(z)
-    flat = jacobian.reshape(-1, len(z))
-    information, directions = np.linalg.eigh(flat.T @ flat / len(errors))
-    known = np.where(information > 1e-12 * information.max(initial=0.0), information, 0.0)
-    covariance = (directions * (prior / (known + prior))) @ directions.T
-    return covariance, tuple(_combination(direction, names) for direction in directions[:, known < 3.0 * prior].T)
+def _uncertainty(information: Array, spread: float, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
+    """Covariance of z, and the combinations that stay about as uncertain as the prior."""
+    strengths, directions = np.linalg.eigh(information)
+    known = np.where(strengths > 1e-12 * strengths.max(initial=0.0), strengths, 0.0) * spread**2
+    covariance = spread**2 * (directions / (known + 1.0)) @ directions.T
+    return covariance, tuple(_combination(direction, names) for direction in directions[:, known < 3.0].T)
 
 
 def _combination(direction: Array, names: Sequence[str]) -> str:
@@ -367,7 +343,7 @@ def _combination(direction: Array, names: Sequence[str]) -> str:
     return " with ".join(involved[:4]) + (" and others" if len(involved) > 4 else "")
 
 
-def _at_bound(problem: _OneStepProblem, z: Array) -> NDArray[np.bool_]:
+def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
     return np.asarray((z - problem.low < _AT_BOUND) | (problem.high - z < _AT_BOUND))
 
 

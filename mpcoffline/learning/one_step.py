@@ -1,0 +1,56 @@
+"""The model's one-step prediction s+ = f_theta(s, a) and its derivatives, for many transitions at once."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.torch_twin import TorchTwin
+
+Array = NDArray[np.float64]
+
+
+class OneStep:
+    """The model's one-step prediction and its derivatives, batched.
+
+    Args:
+        mpc: The MPC whose model it is.
+        parameters: Which coordinates of theta derivatives are taken in, ``(size,)`` booleans.
+    """
+
+    def __init__(self, mpc: MPC, parameters: NDArray[np.bool_]) -> None:
+        f, index = mpc.dynamics_function, np.flatnonzero(parameters)
+        x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", len(parameters))
+        reached = f(x, u, theta)
+        self._shapes = ((mpc.nx,), (mpc.nx, len(index)), (mpc.nx, mpc.nx))
+        parts = [reached, ca.jacobian(reached, theta)[:, index.tolist()].T, ca.jacobian(reached, x).T]
+        self._twins = [
+            TorchTwin(ca.Function("one_step", [x, u, theta], [ca.vertcat(*(ca.vec(ca.densify(y)) for y in parts[:k]))]))
+            for k in (1, 2, 3)
+        ]
+
+    def predict(self, x: Array, u: Array, theta: Array) -> Array:
+        """The prediction f_theta(x, u), ``(B, nx)``."""
+        return self._evaluated(1, x, u, theta)[0]
+
+    def with_slopes(self, x: Array, u: Array, theta: Array) -> tuple[Array, Array]:
+        """The prediction ``(B, nx)`` and df/dtheta over the chosen parameters ``(B, nx, p)``."""
+        predicted, slopes = self._evaluated(2, x, u, theta)
+        return predicted, slopes
+
+    def linearised(self, x: Array, u: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """The prediction, df/dtheta, and df/dx ``(B, nx, nx)``."""
+        predicted, slopes, states = self._evaluated(3, x, u, theta)
+        return predicted, slopes, states
+
+    def _evaluated(self, n_parts: int, x: Array, u: Array, theta: Array) -> list[Array]:
+        columns = [torch.from_numpy(np.ascontiguousarray(v.T)).T for v in (x, u)]  # each entry in one piece of memory
+        with torch.no_grad():
+            flat = self._twins[n_parts - 1](*columns, torch.from_numpy(theta)).numpy()
+        shapes = self._shapes[:n_parts]
+        ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
+        parts = np.split(flat, ends[:-1], axis=1)
+        return [part.reshape(len(x), *shape) for part, shape in zip(parts, shapes, strict=True)]
