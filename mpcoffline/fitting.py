@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.learning import FitResult, ParameterTraining, ValueFunction, ValueTraining
+from mpcoffline.learning.smoothing import identify_smoothed
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.mpc import MPC, NormCost, QuadraticCost
 from mpcoffline.presets import LearnerConfig
@@ -105,8 +106,6 @@ class Fit:
         """The table without measurement noise; the model, where it is learned, by its prediction error."""
         if self._config.init == "nominal":
             return table
-        from mpcoffline.learning.smoothing import identify_smoothed
-
         found = identify_smoothed(self._mpc, table, seed=self._seed)
         if "model" in self._groups:
             self._mpc = self._mpc.with_theta(found.identification.theta)
@@ -171,10 +170,10 @@ class Fit:
             "seed": self._seed,
         }
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        digest.update(np.ascontiguousarray(self._table.rows))
+        digest.update(np.ascontiguousarray(self._table.rows).data)
         if self.value_function is not None:
             for array in self.value_function.to_arrays().values():
-                digest.update(np.ascontiguousarray(array))
+                digest.update(np.ascontiguousarray(array).data)
         return digest.hexdigest()
 
     def to_arrays(self) -> Arrays:

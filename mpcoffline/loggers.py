@@ -58,10 +58,10 @@ class TensorBoardLogger:
                 actual=str(error),
                 hint='pip install "mpcoffline[tensorboard]"',
             ) from error
-        self._writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+        self._writer = SummaryWriter(str(folder))
 
     def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:
         """Writes the scalars of an epoch."""
         for name, value in learner.history[-1][1].items():
-            self._writer.add_scalar(f"fit/{name}", value, total_step)  # type: ignore[no-untyped-call]
-        self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.add_scalar(f"fit/{name}", value, total_step)
+        self._writer.flush()

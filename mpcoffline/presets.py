@@ -91,10 +91,12 @@ class LearnerConfig:
         return cls(**(dict(data) | {"value": ValueConfig(**value), "fit": FitConfig(**data["fit"])}))
 
 
-_IDENTIFIED = LearnerConfig(
+# Half of the terminal cost is a convex quadratic: a network alone has local minima, to which short plans fall.
+_DEFAULT = LearnerConfig(
     least_discount=0.95,
     horizon=20,
     terminal="network",
+    terminal_blend=0.5,
     init="identified",
     value=ValueConfig(method="expectile"),
     fit=FitConfig(n_steps=0),
@@ -104,9 +106,9 @@ PRESETS: dict[str, LearnerConfig] = {
     # The published recipe: (VALUE) by Bellman residual, then (FIT); discount, horizon and terminal cost are the MPC's.
     "paper": LearnerConfig(),
     # What most users should get: the model by identification, the stage cost by (FIT), the terminal cost from V.
-    "default": _IDENTIFIED,
-    # Half the horizon, at which a part of a convex terminal cost is needed.
-    "fast": replace(_IDENTIFIED, horizon=10, terminal_blend=0.5),
-    # For those who can wait: the long horizon besides.
-    "best": replace(_IDENTIFIED, horizon=50),
+    "default": _DEFAULT,
+    # The same at half the horizon.
+    "fast": replace(_DEFAULT, horizon=10),
+    # The same at the long horizon.
+    "best": replace(_DEFAULT, horizon=50),
 }

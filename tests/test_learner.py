@@ -315,7 +315,7 @@ def test_callbacks_and_evaluators_see_every_epoch() -> None:
     assert all(metrics["moved"] > 0.0 for _, metrics in history[3:])
 
 
-class Interruption(Exception):
+class InterruptionError(Exception):
     """What a callback raises to end a fit."""
 
 
@@ -325,12 +325,12 @@ def test_an_interrupted_fit_ends_at_the_same_bits(tmp_path: Path, stop_after: in
 
     def stop(learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:
         if epoch == stop_after + 1:
-            raise Interruption
+            raise InterruptionError
 
     options: dict[str, Any] = {"n_steps_per_epoch": 20, "show_progress": False}
     whole = quick()
     whole.fit(table, **options)
-    with pytest.raises(Interruption):
+    with pytest.raises(InterruptionError):
         quick().fit(table, callbacks=[stop], checkpoint=file, **options)
     resumed = quick()
     resumed.fit(table, checkpoint=file, **options)

@@ -75,7 +75,7 @@ def run_task(
         raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
     setup = setup_of(task, alpha, seed)
     data = load_dataset(dataset or setup.dataset_id)
-    options = {"preset": "paper", "seed": seed, "value": value} | learner_options
+    options: dict[str, Any] = {"preset": "paper", "seed": seed, "value": value} | learner_options
     OfflineMPCLearner(setup.nominal, **options)  # refuses wrong options before a folder is made
     # The folder is made before the work, so that nothing is computed in vain where it cannot be written.
     folder = Path(output) / "controllers"

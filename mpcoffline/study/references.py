@@ -1,0 +1,129 @@
+"""The best costs that are known: optimisation of whole episodes with the true plant and cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.envs import cartpole_swing_up as cartpole
+from mpcoffline.envs import pendulum_swing_up as pendulum
+from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.solvers import make_solver
+from mpcoffline.solvers.interface import Plan
+
+Array = NDArray[np.float64]
+
+EPISODE = 100  # steps
+_TURNS = (-1, 0, 1)  # ways to reach the upright position
+
+
+class _SwingUp(NamedTuple):
+    """A swing-up in the state s: the equation of motion, the cost's weights, the entry that is an angle."""
+
+    env_id: str
+    ode: Callable[[ca.SX, ca.SX, Any], ca.SX]
+    weights: tuple[float, ...]
+    angle: int
+    bound: float
+
+
+def _pendulum(s: ca.SX, u: ca.SX, p: Any) -> ca.SX:
+    gravity = 1.5 * pendulum.GRAVITY / pendulum.LENGTH
+    return ca.vertcat(s[1], gravity * ca.sin(s[0]) + 3.0 / (pendulum.MASS * pendulum.LENGTH**2) * u)
+
+
+def _cartpole(s: ca.SX, u: ca.SX, p: Any) -> ca.SX:
+    sin, cos = ca.sin(s[2]), ca.cos(s[2])
+    mass = cartpole.CART_MASS + cartpole.POLE_MASS
+    moment = cartpole.POLE_MASS * cartpole.HALF_LENGTH
+    force = cartpole.FRICTION * s[1] - u - moment * s[3] ** 2 * sin
+    inertia = cartpole.HALF_LENGTH * (4.0 / 3.0 - cartpole.POLE_MASS * cos**2 / mass)
+    phidd = (cartpole.GRAVITY * sin + cos * force / mass) / inertia
+    xdd = (u - cartpole.FRICTION * s[1] + moment * (s[3] ** 2 * sin - phidd * cos)) / mass
+    return ca.vertcat(s[1], xdd, s[3], phidd)
+
+
+_SWING_UPS = {
+    "pendulum": _SwingUp("mpcoffline/PendulumSwingUp-v0", _pendulum, (1.0, 0.1), 0, pendulum.MAX_TORQUE),
+    "cartpole": _SwingUp("mpcoffline/CartPoleSwingUp-v0", _cartpole, (2.0, 0.1, 1.0, 0.1), 2, cartpole.MAX_FORCE),
+}
+_ACTION_WEIGHT = 0.1
+
+
+def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), discount: float = 1.0) -> Array:
+    """The smallest costs of whole episodes that are known: an upper bound of the optimum.
+
+    Plans of 100 steps are optimised with the true equations of motion and the true stage cost: from scratch, for an
+    upright position after no turn or one turn either way, and from the actions of controllers. Everything is replayed
+    in the environment, the guesses too, and the cheapest counts. At gamma near one most starting points end in poor
+    local minima; the guesses are what matters there.
+
+    Args:
+        task: ``"pendulum"`` or ``"cartpole"``.
+        states: Initial states s, ``(n, ns)``.
+        guesses: Actions of controllers from these states, each ``(n, 100, 1)``.
+        discount: gamma of the cost; 1 for J.
+
+    Returns:
+        Costs, ``(n,)``.
+
+    Raises:
+        InvalidArgumentError: For another task.
+    """
+    if task not in _SWING_UPS:
+        raise InvalidArgumentError("task", expected=f"one of {', '.join(_SWING_UPS)}", actual=repr(task))
+    swing_up, states = _SWING_UPS[task], np.asarray(states, dtype=np.float64)
+    n, angle = len(swing_up.weights), swing_up.angle
+    mpc = MPC(
+        model=Model(swing_up.ode, n, 1, 0.05),
+        stage_cost=QuadraticCost(np.diag(swing_up.weights), [[_ACTION_WEIGHT]]),
+        terminal_cost=QuadraticCost(np.zeros((n, n))),
+        horizon=EPISODE,
+        discount=discount,
+        action_low=[-swing_up.bound],
+        action_high=[swing_up.bound],
+    )
+    solver = make_solver(mpc, "auto")
+    plans = list(guesses)
+    for turns in _TURNS:
+        shifted = states.copy()
+        shifted[:, angle] += 2.0 * np.pi * turns
+        plans.append(solver.solve(shifted).u)
+    for actions in guesses:
+        x = replay(swing_up.env_id, states, actions, discount).states
+        x[..., angle] = np.unwrap(x[..., angle], axis=1)
+        x[..., angle] -= 2.0 * np.pi * np.round(x[:, -1:, angle] / (2.0 * np.pi))
+        plans.append(solver.solve(x[:, 0], warm_start=Plan(x, actions)).u)
+    return np.asarray(np.min([replay(swing_up.env_id, states, u, discount).cost for u in plans], axis=0))
+
+
+class Replay(NamedTuple):
+    """Open loops: states ``(n, T + 1, ns)`` and discounted costs ``(n,)``."""
+
+    states: Array
+    cost: Array
+
+
+def replay(env_id: str, states: Array, actions: Array, discount: float = 1.0) -> Replay:
+    """Applies action sequences ``(n, T, nu)`` from states ``(n, ns)`` in the environment."""
+    env = gym.make_vec(env_id, num_envs=len(states), vectorization_mode="vector_entry_point")
+    _, info = env.reset(options={"state": states})
+    along, total = [info["state"]], np.zeros(len(states))
+    for step in range(actions.shape[1]):
+        _, _, _, _, info = env.step(actions[:, step].astype(np.float32))
+        along.append(info["state"])
+        total += discount**step * info["cost"]
+    env.close()
+    return Replay(np.stack(along, axis=1), total)
+
+
+def initial_states(env: gym.Env[Any, Any], starts: Sequence[str], seed: int) -> Array:
+    """The states ``(n, ns)`` that ``evaluate`` starts from with these kinds of start and this seed."""
+    resets = (env.reset(seed=seed + i, options={"start": start}) for i, start in enumerate(starts))
+    return np.stack([info["state"] for _, info in resets])
