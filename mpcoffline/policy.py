@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
@@ -46,11 +48,23 @@ class MPCPolicy(BasePolicy):
     control loop: the policy applies the next input of the previous plan (or zero, within bounds), counts it in
     :attr:`solver_stats`, and logs a warning the first time.
 
+    The policy is also a plain function, ``policy(observations)``: actions alone, by cold solves.
+
+    With ``deterministic=False`` it explores, so that an MPC can collect data::
+
+        a = clip(u_0* + sigma (high - low) w, low, high),   w ~ N(0, I)
+
+    where ``low`` and ``high`` are the bounds of the action space and sigma is ``exploration_noise``. The plan that
+    travels in ``state`` is that of u_0*, without noise.
+
     Args:
         mpc: The MPC; its state is the environment's observation.
         solver: Name of the solver, see :func:`mpcoffline.make_solver`.
         observation_space: The environment's; unbounded by default.
         action_space: The environment's; float32 with the MPC's input bounds by default.
+        exploration_noise: sigma, a fraction of the action range; SB3's customary ``NormalActionNoise`` of 0.1 in
+            actions scaled to [-1, 1] is 0.05 here.
+        seed: Seeds the noise; :meth:`set_random_seed` starts it anew.
         **solver_options: Passed to the solver.
 
     Attributes:
@@ -58,7 +72,7 @@ class MPCPolicy(BasePolicy):
         solver_stats: Counts since construction.
 
     Raises:
-        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs.
+        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, or a negative noise.
         UnknownIdError: For an unknown solver.
     """
 
@@ -69,6 +83,8 @@ class MPCPolicy(BasePolicy):
         *,
         observation_space: spaces.Box | None = None,
         action_space: spaces.Box | None = None,
+        exploration_noise: float = 0.1,
+        seed: int = 0,
         **solver_options: Any,
     ) -> None:
         if observation_space is None:
@@ -87,7 +103,53 @@ class MPCPolicy(BasePolicy):
         super().__init__(observation_space, action_space)
         self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
         self.solver_stats = SolverStats()
+        self.exploration_noise = exploration_noise
+        self.set_random_seed(seed)
         self._solver: Solver | None = None
+        self._vec_normalize: VecNormalize | None = None
+        self._clipping_reported = False
+
+    @property
+    def exploration_noise(self) -> float:
+        """Standard deviation of the noise under ``deterministic=False``, a fraction of the action range.
+
+        Raises:
+            InvalidArgumentError: On setting a number that is negative or not finite.
+        """
+        return self._exploration_noise
+
+    @exploration_noise.setter
+    def exploration_noise(self, value: float) -> None:
+        if not 0.0 <= value < np.inf:
+            raise InvalidArgumentError("exploration_noise", expected="a finite number >= 0", actual=str(value))
+        self._exploration_noise = float(value)
+
+    def set_random_seed(self, seed: int) -> None:
+        """Starts the exploration noise anew.
+
+        Args:
+            seed: The same seed gives the same noise.
+        """
+        self._noise_generator = np.random.default_rng(seed)
+
+    def with_normalization(self, vec_env: VecEnv | None) -> Self:
+        """The policy for the observations that an environment under ``VecNormalize`` gives.
+
+        An MPC needs observations in their units, so each is un-normalised with the statistics that ``vec_env`` has at
+        that moment; normalised rewards do not matter. What ``VecNormalize`` clipped is lost: the MPC then sees the
+        clipped observation, and a warning is logged the first time. The statistics are not saved with the policy
+        (``VecNormalize.save`` does that).
+
+        Args:
+            vec_env: The environment that will be acted in; wrappers are looked through.
+
+        Returns:
+            A policy that shares everything else with this one; for an environment without ``VecNormalize``, or None,
+            one that takes observations as they are.
+        """
+        policy = copy.copy(self)
+        policy._vec_normalize = None if vec_env is None else unwrap_vec_normalize(vec_env)
+        return policy
 
     @property
     def solver(self) -> Solver:
@@ -96,9 +158,9 @@ class MPCPolicy(BasePolicy):
             self._solver = make_solver(self.mpc, self.solver_name, **self.solver_options)
         return self._solver
 
-    def predict(  # type: ignore[override]
+    def predict(
         self,
-        observation: ArrayLike,
+        observation: ArrayLike | dict[str, NDArray[Any]],
         state: tuple[NDArray[Any], ...] | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
@@ -106,29 +168,40 @@ class MPCPolicy(BasePolicy):
         """The optimal first inputs, and the warm start for the next call.
 
         Args:
-            observation: ``(nx,)``, or ``(B, nx)`` for B environments.
+            observation: ``(nx,)``, or ``(B, nx)`` for B environments; dictionaries are refused.
             state: What the previous call returned; None starts cold.
             episode_start: ``(B,)`` booleans; environments that have just been reset start cold.
-            deterministic: Accepted for SB3; the policy is always deterministic.
+            deterministic: Whether to act without exploration noise.
 
         Returns:
             Actions ``(nu,)`` or ``(B, nu)`` within the bounds and in the dtype of the action space, and the state: the
             plan shifted by one step.
 
         Raises:
-            InvalidArgumentError: For an observation of the wrong shape or with NaN, or a state of another batch size.
+            InvalidArgumentError: For an observation of the wrong shape or with NaN, a state of another batch size, or
+                noise where actions are unbounded.
         """
-        observations = self._checked_observations(observation)
+        given = self._checked_observation(observation)
+        observations = np.atleast_2d(given)
+        if self._vec_normalize is not None:
+            observations = self._unnormalized(observations, self._vec_normalize)
         warm_start = self._warm_start(state, episode_start, len(observations))
         solution = self.solver.solve(observations, warm_start=warm_start)
         inputs, plan = self._with_fallback(solution, warm_start)
+        if not deterministic:
+            inputs = self._explored(inputs)
         space = self._action_box
         actions = np.clip(inputs.astype(space.dtype), space.low, space.high)
-        return (actions[0] if np.ndim(observation) == 1 else actions), plan
+        return (actions[0] if given.ndim == 1 else actions), plan
 
-    def forward(self, observation: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
-        """Actions ``(B, nu)`` of a tensor of observations ``(B, nx)``, by cold solves; without gradients."""
-        return self._predict(observation, deterministic)
+    def forward(self, observation: ArrayLike | torch.Tensor, deterministic: bool = True) -> NDArray[Any] | torch.Tensor:
+        """Actions ``(B, nu)`` of observations ``(B, nx)``, or of one, by cold solves: what ``policy(y)`` returns.
+
+        A tensor gives a tensor, without gradients; anything else an array.
+        """
+        if isinstance(observation, torch.Tensor):
+            return self._predict(observation, deterministic)
+        return self.predict(observation, deterministic=deterministic)[0]
 
     def _predict(self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = True) -> torch.Tensor:
         if isinstance(observation, dict):
@@ -141,18 +214,50 @@ class MPCPolicy(BasePolicy):
         assert isinstance(self.action_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
         return self.action_space
 
-    def _checked_observations(self, observation: ArrayLike) -> NDArray[np.float64]:
-        array = np.asarray(observation, dtype=np.float64)
+    def _checked_observation(self, observation: ArrayLike | dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+        expected = f"shape ({self.mpc.nx},) or (B, {self.mpc.nx})"
+        try:
+            array = np.asarray(cast(ArrayLike, observation), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InvalidArgumentError(
+                "observation",
+                expected=f"an array of {expected}",
+                actual=f"{type(observation).__name__}: {error}",
+                hint="Gymnasium's reset() returns observation and info, a VecEnv's the observations alone.",
+            ) from error
         if array.ndim not in (1, 2) or array.shape[-1] != self.mpc.nx or not array.size:
             raise InvalidArgumentError(
                 "observation",
-                expected=f"shape ({self.mpc.nx},) or (B, {self.mpc.nx})",
+                expected=expected,
                 actual=f"shape {array.shape}",
                 hint="Is the policy used in the environment that its MPC models?",
             )
         if not np.isfinite(array).all():
-            raise InvalidArgumentError("observation", expected="finite numbers", actual=str(array))
-        return np.atleast_2d(array)
+            first = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+            raise InvalidArgumentError(
+                "observation", expected="finite numbers", actual=f"{array[first]} at index {list(first)} of {array}"
+            )
+        return array
+
+    def _unnormalized(self, observations: NDArray[np.float64], vec_env: VecNormalize) -> NDArray[np.float64]:
+        """Observations in their units."""
+        if not vec_env.norm_obs:
+            return observations
+        if not self._clipping_reported and (np.abs(observations) >= np.float32(vec_env.clip_obs)).any():
+            logger.warning("VecNormalize clipped an observation at %g: the MPC sees another state.", vec_env.clip_obs)
+            self._clipping_reported = True
+        return np.asarray(vec_env.unnormalize_obs(observations), dtype=np.float64)
+
+    def _explored(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Inputs with exploration noise, not yet clipped."""
+        width = self._action_box.high.astype(np.float64) - self._action_box.low
+        if not np.isfinite(width).all():
+            raise InvalidArgumentError(
+                "deterministic",
+                expected="True where an action is unbounded, since the noise is a fraction of its range",
+                actual=f"False in {self.action_space}",
+            )
+        return inputs + self.exploration_noise * width * self._noise_generator.standard_normal(inputs.shape)
 
     def _warm_start(
         self, state: tuple[NDArray[Any], ...] | None, episode_start: ArrayLike | None, n_problems: int
@@ -176,13 +281,15 @@ class MPCPolicy(BasePolicy):
             raise InvalidArgumentError(
                 "episode_start", expected=f"shape ({n_problems},)", actual=f"shape {started.shape}"
             )
+        if not started.any():  # as at nearly every step
+            return plan
         return plan.select(~np.broadcast_to(started, (n_problems,)))
 
     def _with_fallback(self, solution: Solution, warm_start: Plan) -> tuple[NDArray[np.float64], Plan]:
         """First inputs and the plan for the next step; where the solve failed, those of the plan before."""
         stats, success = self.solver_stats, solution.success
         stats.n_solves += len(success)
-        stats.iterations += int(np.sum(solution.stats["iterations"]))
+        stats.iterations += int(solution.stats["iterations"].sum())
         stats.time += float(solution.stats["time"])
         if success.all():
             return solution.u0, solution.plan.shifted()
@@ -205,6 +312,7 @@ class MPCPolicy(BasePolicy):
             "mpc": self.mpc.to_json(),
             "solver": self.solver_name,
             "solver_options": self.solver_options,
+            "exploration_noise": self.exploration_noise,
             "observation_space": box_to_json(observation_space),
             "action_space": box_to_json(self._action_box),
         }
@@ -228,5 +336,6 @@ class MPCPolicy(BasePolicy):
                 document["solver"],
                 observation_space=box_from_json(document["observation_space"]),
                 action_space=box_from_json(document["action_space"]),
+                exploration_noise=document.get("exploration_noise", 0.1),
                 **document["solver_options"],
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ import pytest
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from scipy import stats
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.evaluation import evaluate
@@ -98,12 +101,20 @@ def test_tensors_go_in_and_come_out(pendulum: MPCPolicy) -> None:
     y = observations(3)
     expected, _ = pendulum.predict(y)
     tensor = torch.as_tensor(y, dtype=torch.float64)
-    for found in (pendulum(tensor), pendulum._predict(tensor, deterministic=False)):
+    for found in (pendulum(tensor), pendulum._predict(tensor, deterministic=True)):
         assert isinstance(found, torch.Tensor)
         assert found.dtype == torch.float32
         np.testing.assert_array_equal(found.numpy(), expected)
     with pytest.raises(InvalidArgumentError, match="observation: expected a tensor, got a dictionary"):
         pendulum._predict({"y": tensor})
+
+
+def test_is_a_plain_function(pendulum: MPCPolicy) -> None:
+    y = observations(3)
+    expected, _ = pendulum.predict(y)
+    np.testing.assert_array_equal(pendulum(y), expected)
+    np.testing.assert_array_equal(pendulum(y[1]), expected[1])
+    np.testing.assert_array_equal(pendulum(list(y[1])), expected[1])
 
 
 def plain() -> gym.Env[Any, Any]:
@@ -114,10 +125,21 @@ def vector(n: int) -> Callable[[], VecEnv]:
     return lambda: DummyVecEnv([lambda: Monitor(plain())] * n)
 
 
+def processes() -> VecEnv:
+    """Two processes, which import what the environment's id names."""
+    return make_vec_env(f"mpcoffline:{PENDULUM}", n_envs=2, vec_env_cls=SubprocVecEnv)
+
+
 @pytest.mark.parametrize(
     "make",
-    [plain, lambda: Monitor(plain()), vector(1), vector(3), lambda: VecMonitor(DummyVecEnv([plain] * 4))],
-    ids=["plain", "Monitor", "DummyVecEnv", "three", "VecMonitor"],
+    [
+        pytest.param(plain, id="plain"),
+        pytest.param(lambda: Monitor(plain()), id="Monitor"),
+        pytest.param(vector(1), id="DummyVecEnv"),
+        pytest.param(vector(3), id="three"),
+        pytest.param(lambda: VecMonitor(DummyVecEnv([plain] * 4)), id="VecMonitor"),
+        pytest.param(processes, id="SubprocVecEnv", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped")
 def test_sb3_evaluates_to_the_same_costs_as_evaluate(pendulum: MPCPolicy, make: Callable[[], Any]) -> None:
@@ -140,6 +162,46 @@ def test_sb3_evaluates_to_the_same_costs_as_evaluate(pendulum: MPCPolicy, make: 
     assert lengths == [100] * n
     # float32 rewards of a VecEnv
     np.testing.assert_allclose(np.sort(-np.array(returns)), np.sort(expected), rtol=1e-5)
+    env.close()
+
+
+# ---------------------------------------------------------------- exploration
+
+
+def test_noise_is_gaussian_in_fractions_of_the_range_and_clipped() -> None:
+    """At x = 0 the optimal input is 0; bounds -20 and 20."""
+    policy = MPCPolicy(lq_plant.make_mpc(), exploration_noise=0.2, seed=3)
+    actions, plan = policy.predict(np.zeros((4000, 2)), deterministic=False)
+    inside = np.abs(actions) < 20.0
+    assert stats.kstest(actions[inside] / 8.0, stats.truncnorm(-2.5, 2.5).cdf).pvalue > 0.01
+    np.testing.assert_allclose((actions == 20.0).mean(), stats.norm.sf(2.5), atol=0.004)
+    assert all(policy.action_space.contains(action) for action in actions)
+    np.testing.assert_allclose(plan.u, 0.0, atol=1e-9)  # what is carried on is the plan without noise
+
+
+def test_the_same_seed_gives_the_same_noise() -> None:
+    policy, x = MPCPolicy(lq_plant.make_mpc(), seed=1), np.zeros((5, 2))
+    first = policy.predict(x, deterministic=False)[0]
+    second = policy.predict(x, deterministic=False)[0]
+    assert (first != second).all()
+    policy.set_random_seed(1)
+    np.testing.assert_array_equal(policy.predict(x, deterministic=False)[0], first)
+    np.testing.assert_array_equal(policy(x, deterministic=False), second)
+    policy.exploration_noise = 0.0
+    np.testing.assert_array_equal(policy.predict(x, deterministic=False)[0], policy.predict(x)[0])
+
+
+@pytest.mark.parametrize("noise", [-0.1, np.nan, np.inf])
+def test_noise_out_of_range_is_refused(noise: float) -> None:
+    with pytest.raises(InvalidArgumentError, match="exploration_noise: expected a finite number >= 0"):
+        MPCPolicy(lq_plant.make_mpc(), exploration_noise=noise)
+
+
+def test_noise_without_bounds_is_refused() -> None:
+    policy = MPCPolicy(lq_plant.make_mpc(action_low=[-np.inf], action_high=[np.inf]))
+    policy.predict(np.zeros(2))
+    with pytest.raises(InvalidArgumentError, match="deterministic: expected True where an action is unbounded"):
+        policy.predict(np.zeros(2), deterministic=False)
 
 
 # ---------------------------------------------------------------- the warm start
@@ -232,6 +294,26 @@ def test_a_warm_start_saves_iterations(solver: str) -> None:
     assert counts["warm"] < 0.5 * counts["cold"]
 
 
+def test_each_environment_of_a_vec_env_has_its_own_warm_start(pendulum: MPCPolicy) -> None:
+    """Episodes that end at different steps: the same actions, bit for bit, as in loops of their own."""
+    lengths = (4, 6, 9)
+
+    def loop(lengths: tuple[int, ...], seed: int) -> Array:
+        env = DummyVecEnv([partial(gym.make, PENDULUM, max_episode_steps=length) for length in lengths])
+        env.seed(seed)
+        y, state, start = env.reset(), None, np.ones(len(lengths), dtype=bool)
+        actions = []
+        for _ in range(15):
+            action, state = pendulum.predict(y, state=state, episode_start=start, deterministic=True)
+            y, _, start, _ = env.step(action)
+            actions.append(action)
+        return np.stack(actions, axis=1)
+
+    together = loop(lengths, seed=5)
+    for i, length in enumerate(lengths):
+        np.testing.assert_array_equal(together[i], loop((length,), seed=5 + i)[0])
+
+
 def test_a_state_of_another_batch_is_refused(recording: MPCPolicy) -> None:
     _, state = recording.predict(np.zeros((2, 2)))
     with pytest.raises(InvalidArgumentError, match="state: expected the state of 3 environments, got that of 2"):
@@ -313,8 +395,14 @@ def test_a_closed_loop_survives_a_solver_that_always_fails(monkeypatch: pytest.M
         (np.zeros((2, 2, 3)), "observation"),
         (1.0, "observation"),
         (np.zeros((0, 3)), "observation"),
-        ([1.0, np.nan, 0.0], "observation: expected finite numbers"),
-        ([[1.0, 0.0, 0.0], [1.0, 0.0, np.inf]], "observation: expected finite numbers"),
+        ([1.0, np.nan, 0.0], r"observation: expected finite numbers, got nan at index \[1\] of"),
+        ([[1.0, 0.0, 0.0], [1.0, 0.0, np.inf]], r"observation: expected finite numbers, got inf at index \[1, 2\] of"),
+        (
+            (np.zeros(3), {"state": 0}),
+            r"observation: expected an array .* got tuple.*reset\(\) returns observation and info",
+        ),
+        ({"y": np.zeros(3)}, "observation: expected an array .* got dict"),
+        ("upright", "observation: expected an array .* got str"),
     ],
 )
 def test_wrong_observations_are_refused(pendulum: MPCPolicy, bad: Any, message: str) -> None:
@@ -369,11 +457,12 @@ def test_a_saved_policy_acts_the_same(tmp_path: Path, pendulum: MPCPolicy) -> No
 
 
 def test_solver_and_options_are_saved(tmp_path: Path) -> None:
-    policy = MPCPolicy(lq_plant.make_mpc(), "ipopt", max_iterations=17, tolerance=1e-6)
+    policy = MPCPolicy(lq_plant.make_mpc(), "ipopt", exploration_noise=0.3, max_iterations=17, tolerance=1e-6)
     policy.save(tmp_path / "p.zip")
     loaded = MPCPolicy.load(tmp_path / "p.zip", device="cpu")
     assert loaded.solver_name == "ipopt"
     assert loaded.solver_options == {"max_iterations": 17, "tolerance": 1e-6}
+    assert loaded.exploration_noise == 0.3
     assert isinstance(loaded.solver, IpoptSolver)
 
 
