@@ -80,12 +80,12 @@ class Viewer:
         self._step, self._cost = 0, 0.0
         self._action: Array | None = None
         self._canvas: Canvas | None = None
-        self._window: pygame.Surface | None = None
+        self._shown = False
         self._clock: pygame.time.Clock | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but pygame's objects, which are not pickled or copied but made again."""
-        return self.__dict__ | {"_canvas": None, "_window": None, "_clock": None}
+        return self.__dict__ | {"_canvas": None, "_clock": None, "_shown": False}
 
     def begin(self, state: Array) -> None:
         """An episode starts in a state ``(nx,)``."""
@@ -116,24 +116,23 @@ class Viewer:
 
     def close(self) -> None:
         """Closes the window, if there is one; can be repeated."""
-        if self._window is not None:
+        if self._shown:
             pygame, _ = load_pygame()
-            if pygame.display.get_surface() is self._window:
-                pygame.display.quit()
-        self._canvas = self._window = self._clock = None
+            pygame.display.quit()
+        self._canvas, self._clock, self._shown = None, None, False
 
     def _show(self, canvas: Canvas) -> None:
         pygame, _ = load_pygame()
-        window = self._window
-        # pygame has one window, that another environment may have taken or closed.
-        if window is None or pygame.display.get_surface() is not window:
+        # pygame has one window, that another environment may have taken or closed since.
+        window = pygame.display.get_surface()
+        if window is None or window.get_size() != self._size:
             pygame.display.init()
             pygame.display.set_caption("mpcoffline")
-            window = self._window = pygame.display.set_mode(self._size)
-        if self._clock is None:
-            self._clock = pygame.time.Clock()
+            window = pygame.display.set_mode(self._size)
+        self._shown = True
         window.blit(canvas.picture(), (0, 0))
         pygame.event.pump()
+        self._clock = self._clock or pygame.time.Clock()
         self._clock.tick(round(1.0 / self._dt))
         pygame.display.flip()
 

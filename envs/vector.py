@@ -79,7 +79,7 @@ class ControlTaskVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
-        self._noise = _NormalRows(num_envs, (2, nx)) if self.task.noisy else None
+        self._noise = _NormalRows(num_envs, nx) if self.task.noisy else None
         self._starts: list[dict[str, Any]] = [{}] * num_envs
         self._state = np.zeros((num_envs, nx))
         self._observation: Observation = self.task.observe(self._state)
@@ -257,9 +257,9 @@ class _NormalRows:
 
     _BLOCK = 64
 
-    def __init__(self, n: int, shape: tuple[int, int]) -> None:
+    def __init__(self, n: int, nx: int) -> None:
         self._generators: list[np.random.Generator | None] = [None] * n
-        self._rows = np.zeros((n, self._BLOCK, *shape))
+        self._rows = np.zeros((self._BLOCK, 2, n, nx))
         self._next = np.zeros(n, dtype=np.intp)
 
     def restart(self, i: int, generator: np.random.Generator) -> None:
@@ -267,16 +267,20 @@ class _NormalRows:
         self._generators[i], self._next[i] = generator, self._BLOCK
 
     def next(self, copies: Indices) -> Array:
-        """The next numbers of some copies, ``(2, n, nx)``; zeros for the others."""
-        for i in copies[self._next[copies] == self._BLOCK]:
+        """The next numbers of some copies, those of w and of v, ``(2, n, nx)``; of any value for the others."""
+        block, _, n, nx = self._rows.shape
+        for i in copies[self._next[copies] == block]:
             generator = self._generators[i]
             if generator is not None:
-                generator.standard_normal(out=self._rows[i])
+                self._rows[:, :, i] = generator.standard_normal((block, 2, nx))
             self._next[i] = 0
-        normals = np.zeros((len(self._rows), *self._rows.shape[2:]))
-        normals[copies] = self._rows[copies, self._next[copies]]
+        rows = self._next[copies]
         self._next[copies] += 1
-        return normals.transpose(1, 0, 2)
+        if len(copies) == n and (rows == rows[0]).all():
+            return np.asarray(self._rows[rows[0]])
+        normals = np.zeros((2, n, nx))
+        normals[:, copies] = self._rows[rows, :, copies].swapaxes(0, 1)
+        return normals
 
 
 def _checked_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
