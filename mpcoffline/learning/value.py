@@ -8,6 +8,7 @@ from .progress import Report, silent
 from .value_config import VALUE_METHODS, ValueConfig, cosine
 from .value_function import ValueFunction
 from .value_methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
+from .value_noise import Stochasticity, estimate_stochasticity
 from .value_training import ValueTraining
 
 __all__ = [
@@ -15,12 +16,14 @@ __all__ = [
     "Expectile",
     "ImplicitQ",
     "Residual",
+    "Stochasticity",
     "TemporalDifference",
     "ValueConfig",
     "ValueFunction",
     "ValueMethod",
     "ValueTraining",
     "cosine",
+    "estimate_stochasticity",
     "fit_value",
 ]
 

@@ -10,7 +10,7 @@ from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from .checks import check_integers, check_number
 from .value_methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
 
-VALUE_METHODS = ("residual", "td", "expectile", "iql")
+VALUE_METHODS = ("residual", "td", "expectile", "iql", "auto")
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,9 @@ class ValueConfig:
     """How V_phi is learned.
 
     Attributes:
-        method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, or ``"iql"`` for noisy plants.
+        method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, ``"iql"`` for noisy plants, or
+            ``"auto"``: ``"iql"`` where the data are noisy
+            (:func:`~mpcoffline.learning.value_noise.estimate_stochasticity`), else ``"expectile"``.
         tau: The expectile, for ``"expectile"`` and ``"iql"``.
         n_steps: Gradient steps.
         batch_size: Transitions a step.
@@ -54,15 +56,19 @@ class ValueConfig:
         check_number("polyak", self.polyak, 0.0, 1.0)
         check_number("validation", self.validation, 0.0, 0.9, open_low=False)
 
-    def build(self) -> ValueMethod:
-        """The loss."""
+    def build(self, *, noisy: bool = False) -> ValueMethod:
+        """The loss.
+
+        Args:
+            noisy: What ``"auto"`` goes by.
+        """
         methods: dict[str, ValueMethod] = {
             "residual": Residual(),
             "td": TemporalDifference(),
             "expectile": Expectile(self.tau),
             "iql": ImplicitQ(self.tau),
         }
-        return methods[self.method]
+        return methods[("iql" if noisy else "expectile") if self.method == "auto" else self.method]
 
 
 def cosine(step: int, n_steps: int) -> float:

@@ -96,9 +96,9 @@ class _Output(torch.autograd.Function):
             torch.mm(activations[k].t(), back, out=dW)
             torch.sum(back, dim=0, out=db)
             if k > 0:
-                h = activations[k]
                 back = back @ layers[k][0].t()
-                back.addcmul_(back * h, h, value=-1)  # tanh' = 1 - tanh^2
+                squares = activations[k].square_()  # in place: large new tensors cost page faults
+                back.addcmul_(back, squares, value=-1)  # tanh' = 1 - tanh^2
         return gradient, None, None
 
 
@@ -108,18 +108,28 @@ class FlatCritic:
     Args:
         networks: V, and perhaps Q on (s, a).
         weights: One vector a network.
+        bounds: Between which all outputs are held.
     """
 
-    def __init__(self, networks: Sequence[FlatNetwork], weights: Sequence[Tensor]) -> None:
-        self.networks, self.weights = list(networks), list(weights)
+    def __init__(
+        self,
+        networks: Sequence[FlatNetwork],
+        weights: Sequence[Tensor],
+        bounds: tuple[float, float] | None = None,
+    ) -> None:
+        self.networks, self.weights, self.bounds = list(networks), list(weights), bounds
 
     def __call__(self, observations: Tensor) -> Tensor:
         """V of observations ``(..., ny)``, shape ``(...)``."""
-        return self.networks[0](self.weights[0], observations)
+        return self._outputs(0, observations)
 
     def q(self, observations: Tensor, actions: Tensor) -> Tensor:
         """Q of observations ``(..., ny)`` and actions ``(..., nu)``, shape ``(...)``."""
-        return self.networks[1](self.weights[1], torch.cat([observations, actions], dim=-1))
+        return self._outputs(1, torch.cat([observations, actions], dim=-1))
+
+    def _outputs(self, i: int, x: Tensor) -> Tensor:
+        y = self.networks[i](self.weights[i], x)
+        return y if self.bounds is None else y.clamp(*self.bounds)
 
 
 class Member:
@@ -127,14 +137,15 @@ class Member:
 
     Args:
         nets: V's initial network, and Q's where the method learns one.
+        bounds: Between which the target is held.
         device: Torch device.
     """
 
-    def __init__(self, nets: Sequence[nn.Sequential], device: str) -> None:
+    def __init__(self, nets: Sequence[nn.Sequential], bounds: tuple[float, float], device: str) -> None:
         networks = [FlatNetwork.like(net) for net in nets]
         start = [network.weights_of(net).to(device) for network, net in zip(networks, nets, strict=True)]
         self.critic = FlatCritic(networks, [weights.clone().requires_grad_() for weights in start])
-        self.target = FlatCritic(networks, start)
+        self.target = FlatCritic(networks, start, bounds)
         self._optimiser = torch.optim.Adam(self.critic.weights, fused=True)
 
     def descend(

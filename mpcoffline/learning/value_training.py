@@ -18,11 +18,15 @@ from mpcoffline.errors import FileFormatError, MPCOfflineError
 from .progress import Metrics
 from .value_config import ValueConfig, cosine
 from .value_function import ValueFunction, tanh_network
+from .value_methods import Residual, ValueMethod
 from .value_network import Member
+from .value_noise import Stochasticity, estimate_stochasticity
+from .value_units import Units
 
 VALIDATE_EVERY = 250  # steps
 _VALIDATION_ROWS = 8_192
 _LOST = 25  # steps in a row without a finite gradient
+_SWEEPS = 3.0  # times 1 / (1 - gamma): how often the target must have followed
 
 _log = logging.getLogger(__name__)
 
@@ -30,8 +34,8 @@ _log = logging.getLogger(__name__)
 class ValueTraining:
     """The state of a regression of V_phi between two of its steps.
 
-    It learns in the units of the network, see :class:`Units`. The members of an ensemble see the same minibatches and
-    differ by their initial weights.
+    It learns in the units of the network (:class:`~mpcoffline.learning.value_units.Units`). The members of an ensemble
+    see the same minibatches and differ by their initial weights.
 
     Example:
         >>> training = ValueTraining(table, 0.95, ValueConfig(), seed=0)
@@ -50,6 +54,8 @@ class ValueTraining:
     Attributes:
         step: Steps made.
         n_steps: Steps in all, unless the validation loss stops falling before.
+        method: The loss; what ``"auto"`` chose.
+        stochasticity: What ``"auto"`` found in the data; None where the method was given.
     """
 
     def __init__(
@@ -57,17 +63,19 @@ class ValueTraining:
     ) -> None:
         self.step, self.n_steps = 0, config.n_steps
         self._config, self._discount, self._device = config, discount, device
-        self._method = config.build()
+        self.stochasticity = estimate_stochasticity(table, seed=seed) if config.method == "auto" else None
+        self.method = config.build(noisy=self.stochasticity is not None and self.stochasticity.is_noisy)
+        _tell(self.method, self.stochasticity, config, discount)
         table, held_out = split_episodes(table, config.validation, seed)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self._value = ValueFunction(table.ny, config.hidden, config.n_members)
             nets = [[net] for net in self._value.members]
-            if self._method.learns_q:
+            if self.method.learns_q:
                 nets = [[net, tanh_network(table.ny + table.nu, config.hidden)] for [net] in nets]
         self._value.normalise(table, discount)
         self._units = Units(table, self._value, discount, device)
-        self._members = [Member(pair, device) for pair in nets]
+        self._members = [Member(pair, self._units.bounds, device) for pair in nets]
         self._batches = table.batches(config.batch_size, np.random.default_rng(seed))
         self._validation = None if held_out is None else self._batch(next(held_out.batches(_VALIDATION_ROWS, seed)))
         self._validation_loss, self._best_loss = math.nan, math.inf
@@ -156,8 +164,7 @@ class ValueTraining:
         config, batch = self._config, self._batch(next(self._batches))
         learning_rate = config.learning_rate * cosine(self.step, self.n_steps)
         losses = [
-            member.descend(self._method, batch, self._discount, learning_rate, config.polyak)
-            for member in self._members
+            member.descend(self.method, batch, self._discount, learning_rate, config.polyak) for member in self._members
         ]
         finite = [loss for loss in losses if math.isfinite(loss)]
         self._skipped = 0 if len(finite) == len(losses) else self._skipped + 1
@@ -176,45 +183,10 @@ class ValueTraining:
         """Keeps the weights where the loss on the held-out episodes is the smallest so far."""
         if self._validation is None:
             return
-        losses = [member.loss(self._method, self._validation, self._discount) for member in self._members]
+        losses = [member.loss(self.method, self._validation, self._discount) for member in self._members]
         self._validation_loss = float(np.mean(losses))
         if self._validation_loss < self._best_loss:
             self._best_loss, self._best_step, self._best = self._validation_loss, self.step, self._weights()
-
-
-class Units:
-    """Transitions in the units of V's network, in which the Bellman equation keeps its form.
-
-    ::
-
-        V' = (V - offset) / scale,    L' = (L - offset + gamma (1 - terminated) offset) / scale
-
-    Computed in float64, so that a large constant in the cost costs no accuracy.
-
-    Args:
-        table: The transitions.
-        value: V with its normalisation.
-        discount: gamma.
-        device: Torch device.
-    """
-
-    def __init__(self, table: TransitionTable, value: ValueFunction, discount: float, device: str = "cpu") -> None:
-        statistics = table.statistics()
-        std = torch.from_numpy(statistics.std.actions)
-        action_mean, action_std = torch.from_numpy(statistics.mean.actions), torch.where(std > 0.0, std, 1.0)
-        one = torch.ones(1, dtype=torch.float64)
-        offset, scale = value.offset.reshape(1), value.scale.reshape(1)
-        shift = [value.mean, action_mean, (1.0 - discount) * offset, value.mean, 0.0 * one]
-        spread = [value.std, action_std, scale, value.std, one]
-        self._shift, self._spread = torch.cat(shift).to(device), torch.cat(spread).to(device)
-        self._end = float(discount * offset / scale)
-        self._table = table
-
-    def columns(self, rows: Tensor) -> Columns:
-        """The columns of packed rows ``(B, 2 ny + nu + 2)`` of the table, float32."""
-        batch = self._table.columns((rows - self._shift) / self._spread)
-        costs = batch.costs - self._end * batch.terminations
-        return Columns(*(column.float() for column in batch._replace(costs=costs)))
 
 
 def split_episodes(table: TransitionTable, share: float, seed: int) -> tuple[TransitionTable, TransitionTable | None]:
@@ -225,3 +197,24 @@ def split_episodes(table: TransitionTable, share: float, seed: int) -> tuple[Tra
         _log.warning("%s is one episode: (VALUE) learns from all of it, without validation", table.name)
         return table, None
     return table.split(1.0 - share, seed)
+
+
+def _tell(method: ValueMethod, found: Stochasticity | None, config: ValueConfig, discount: float) -> None:
+    """Logs what was chosen, and a schedule too short for this discount."""
+    if found is not None:
+        _log.info(
+            "(VALUE) learns by %s: given (s, a), %.1f %% of the variance of s+ - s and %.1f %% of that of L are noise",
+            method,
+            100.0 * found.change,
+            100.0 * found.cost,
+        )
+    sweeps = config.polyak * config.n_steps * (1.0 - discount)
+    if sweeps < _SWEEPS and discount < 1.0 and not isinstance(method, Residual):
+        _log.warning(
+            "(VALUE) may end before V has settled: polyak * n_steps * (1 - discount) is %.2g, below %g; raise n_steps "
+            "(%d) or polyak (%g)",
+            sweeps,
+            _SWEEPS,
+            config.n_steps,
+            config.polyak,
+        )
