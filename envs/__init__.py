@@ -1,7 +1,7 @@
 """The three tasks of arXiv:2301.01667 as Gymnasium environments.
 
 Importing this package registers ``mpcoffline/LinearTracking-v0``, ``mpcoffline/PendulumSwingUp-v0`` and
-``mpcoffline/CartPoleSwingUp-v0``. It needs numpy and gymnasium only.
+``mpcoffline/CartPoleSwingUp-v0``. It needs numpy and gymnasium only, and pygame to draw.
 """
 
 from __future__ import annotations

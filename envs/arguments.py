@@ -21,7 +21,7 @@ def checked_number(name: str, value: float, low: float, high: float, unit: str =
     Raises:
         ValueError: For anything but a number from ``low`` to ``high``.
     """
-    number = _floats(value)
+    number = floats_of(value)
     if number is None or number.shape != () or not low <= number <= high:
         raise ValueError(f"{name}: expected a number from {low:g} to {high:g}{unit and ' ' + unit}, got {value!r}.")
     return float(number)
@@ -33,7 +33,7 @@ def checked_matrix(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array
     Raises:
         ValueError: For another shape, or an entry that is not finite.
     """
-    array = _floats(value)
+    array = floats_of(value)
     if array is None or array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite numbers of shape {shape}, got {value!r}.")
     return array
@@ -45,7 +45,7 @@ def checked_deviations(name: str, value: ArrayLike, n: int) -> Array:
     Raises:
         ValueError: For another shape, or an entry that is negative or not finite.
     """
-    array = _floats(value)
+    array = floats_of(value)
     if array is None or array.shape not in ((), (n,)) or not (np.isfinite(array).all() and (array >= 0.0).all()):
         raise ValueError(f"{name}: expected a standard deviation >= 0, or {n} of them (one a state), got {value!r}.")
     return np.broadcast_to(array, (n,)).copy()
@@ -57,7 +57,7 @@ def checked_state(name: str, value: ArrayLike, space: spaces.Box) -> Array:
     Raises:
         ValueError: For another shape, or an entry that is not finite or out of range.
     """
-    array = _floats(value)
+    array = floats_of(value)
     if array is None:
         raise ValueError(f"{name}: expected numbers of shape {space.shape}, got {value!r}.")
     if array.shape != space.shape:
@@ -117,8 +117,8 @@ def _spread(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
     return np.full(shape, value) if np.ndim(value) == 0 else value
 
 
-def _floats(value: ArrayLike) -> Array | None:
-    """A float64 copy, or None for what is not made of numbers."""
+def floats_of(value: ArrayLike) -> Array | None:
+    """``value`` as a float64 array, or None for what is not made of numbers."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths

@@ -51,6 +51,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     A task states its plant and its cost as four functions of arrays with any leading dimensions
     (:meth:`next_state`, :meth:`cost`, :meth:`observe`, :meth:`is_success`), how an episode starts
     (:meth:`sample_state`) and what it looks like (:meth:`draw`); this class turns them into a Gymnasium environment.
+    A task sets its spaces and :attr:`state_limit` before it calls this class's ``__init__``.
 
     The simulation runs in float64. Every ``info`` carries ``"cost"`` (the cost L(s_k, a_k) of the step just taken as
     float64; 0 at reset), ``"state"`` (the state s reached, float64) and ``"is_success"``. A task never

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from .arguments import Array, checked_render_mode
+from .arguments import Array, checked_render_mode, floats_of
 from .base import ControlTask, Observation
 from .rendering import Frame
 
@@ -226,8 +226,8 @@ class ControlTaskVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[
                 )
             if not self._started:
                 raise gym.error.ResetNeeded("reset option 'reset_mask': expected all copies to be reset before.")
-        states = common.get("state")
-        if states is None or np.ndim(states) != 2:
+        states = floats_of(common["state"]) if "state" in common else None
+        if states is None or states.ndim != 2:
             return [common] * self.num_envs, mask
         if len(states) != self.num_envs:
             raise ValueError(f"reset option 'state': expected {self.num_envs} rows, got {len(states)}.")

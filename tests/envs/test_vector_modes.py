@@ -194,6 +194,7 @@ def test_frames_a_second_follow_the_task() -> None:
         ({"reset_mask": np.zeros(3, bool)}, "'reset_mask': expected 3 booleans, one of them true"),
         ({"reset_mask": np.ones(2, bool)}, "'reset_mask': expected 3 booleans"),
         ({"state": [4.0, 0.0]}, "'state': expected finite values"),
+        ({"state": [[0.0], [0.0, 1.0], [0.0]]}, "'state': expected numbers of shape"),
         ({"state": np.zeros((3, 2)), "start": "broad"}, "at most one of"),
     ],
 )
