@@ -23,6 +23,9 @@ Arrays = dict[str, NDArray[Any]]
 
 _log = logging.getLogger(__name__)
 
+_OTHER_MAGNITUDE = 30.0
+_SCALE_ROWS = 5_000
+
 
 class Epoch(NamedTuple):
     """A stretch of a fit.
@@ -98,6 +101,7 @@ class Fit:
             MPCOfflineError: If a regression fails.
         """
         table = self._identified(self._table).trim(self._config.trim)
+        self._mpc = in_units_of(self._mpc, table)
         if self.value_function is None:
             yield from self._learn_value(table, value_epoch)
         yield from self._learn_parameters(table, fit_epoch)
@@ -198,15 +202,33 @@ def restructured(nominal: MPC, config: LearnerConfig) -> MPC:
     horizon = nominal.horizon if config.horizon is None else config.horizon
     mpc = nominal.replace(discount=discount, horizon=horizon)
     cost = nominal.stage_cost
-    if config.cross_term and isinstance(cost, QuadraticCost) and cost.nu and "H" not in cost.values:
-        cross = np.zeros((cost.nx, cost.nu))
-        values = cost.values
+    if config.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
+        values, cross = cost.values, np.zeros((cost.nx, cost.nu))
         constant = float(values["constant"])
         crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
         return mpc.replace(stage_cost=crossed)
     if config.cross_term:
         _log.info("cross_term has no effect on a stage cost that is not quadratic or has one already")
     return mpc
+
+
+def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
+    """The MPC with the weights of its stage cost scaled to the logged cost, where these are of other magnitudes.
+
+    (FIT) measures distances in the size of theta_0, which has to be that of the cost in the data within a factor of 30.
+    """
+    rows = table.columns(table.rows[:: max(1, len(table) // _SCALE_ROWS)])
+    stage = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full()
+    logged, nominal = float(rows.costs.std(dtype=np.float64)), float(stage.std())
+    factor = logged / nominal if nominal > 0.0 else 1.0
+    if not np.isfinite(factor) or 1.0 / _OTHER_MAGNITUDE < factor < _OTHER_MAGNITUDE or factor == 0.0:
+        return mpc
+    _log.warning("the logged cost varies %.3g times as much as the MPC's stage cost, which is scaled to it", factor)
+    theta = mpc.theta
+    for block in mpc.space:
+        if block.group == "cost" and block.kind == "psd":
+            theta[mpc.space.slices[block.name]] *= np.sqrt(factor)  # of W = C C'
+    return mpc.with_theta(theta)
 
 
 def _reference(mpc: MPC) -> NDArray[np.float64]:

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from mpcoffline.envs import cartpole_swing_up as cartpole
 from mpcoffline.envs import pendulum_swing_up as pendulum
 from mpcoffline.errors import InvalidArgumentError
-from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.mpc import MPC, LiftedCost, Model, QuadraticCost
 from mpcoffline.solvers import make_solver
 from mpcoffline.solvers.interface import Plan
 
 Array = NDArray[np.float64]
 
 EPISODE = 100  # steps
-_TURNS = (-1, 0, 1)  # ways to reach the upright position
 
 
 class _SwingUp(NamedTuple):
@@ -31,6 +30,7 @@ class _SwingUp(NamedTuple):
     weights: tuple[float, ...]
     angle: int
     bound: float
+    dt: float = pendulum.PendulumSwingUpEnv.dt  # of both
 
 
 def _pendulum(s: ca.SX, u: ca.SX, p: Any) -> ca.SX:
@@ -59,10 +59,9 @@ _ACTION_WEIGHT = 0.1
 def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), discount: float = 1.0) -> Array:
     """The smallest costs of whole episodes that are known: an upper bound of the optimum.
 
-    Plans of 100 steps are optimised with the true equations of motion and the true stage cost: from scratch, for an
-    upright position after no turn or one turn either way, and from the actions of controllers. Everything is replayed
-    in the environment, the guesses too, and the cheapest counts. At gamma near one most starting points end in poor
-    local minima; the guesses are what matters there.
+    Plans of 100 steps are optimised with the true equations of motion and the true stage cost, from scratch and from
+    the actions of controllers. Everything is replayed in the environment, the guesses too, and the cheapest counts. At
+    gamma near one most starting points end in poor local minima; the guesses are what matters there.
 
     Args:
         task: ``"pendulum"`` or ``"cartpole"``.
@@ -79,28 +78,32 @@ def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), di
     if task not in _SWING_UPS:
         raise InvalidArgumentError("task", expected=f"one of {', '.join(_SWING_UPS)}", actual=repr(task))
     swing_up, states = _SWING_UPS[task], np.asarray(states, dtype=np.float64)
+    solver = make_solver(_episode(swing_up, discount), "auto")
+    plans = [solver.solve(states).u, *guesses]
+    for actions in guesses:
+        x = replay(swing_up.env_id, states, actions, discount).states
+        x[..., swing_up.angle] = np.unwrap(x[..., swing_up.angle], axis=1)
+        plans.append(solver.solve(states, warm_start=Plan(x, actions)).u)
+    return np.asarray(np.min([replay(swing_up.env_id, states, u, discount).cost for u in plans], axis=0))
+
+
+def _episode(swing_up: _SwingUp, discount: float) -> MPC:
+    """A whole episode as one optimal control problem in s; the cost wraps the angle, as the environment's does."""
     n, angle = len(swing_up.weights), swing_up.angle
-    mpc = MPC(
-        model=Model(swing_up.ode, n, 1, 0.05),
-        stage_cost=QuadraticCost(np.diag(swing_up.weights), [[_ACTION_WEIGHT]]),
+
+    def wrapped(s: ca.SX) -> ca.SX:
+        phi = ca.atan2(ca.sin(s[angle]), ca.cos(s[angle]))
+        return ca.vertcat(*(phi if i == angle else s[i] for i in range(n)))
+
+    return MPC(
+        model=Model(swing_up.ode, n, 1, swing_up.dt),
+        stage_cost=LiftedCost(wrapped, np.zeros(n), np.diag(swing_up.weights), [[_ACTION_WEIGHT]]),
         terminal_cost=QuadraticCost(np.zeros((n, n))),
         horizon=EPISODE,
         discount=discount,
         action_low=[-swing_up.bound],
         action_high=[swing_up.bound],
     )
-    solver = make_solver(mpc, "auto")
-    plans = list(guesses)
-    for turns in _TURNS:
-        shifted = states.copy()
-        shifted[:, angle] += 2.0 * np.pi * turns
-        plans.append(solver.solve(shifted).u)
-    for actions in guesses:
-        x = replay(swing_up.env_id, states, actions, discount).states
-        x[..., angle] = np.unwrap(x[..., angle], axis=1)
-        x[..., angle] -= 2.0 * np.pi * np.round(x[:, -1:, angle] / (2.0 * np.pi))
-        plans.append(solver.solve(x[:, 0], warm_start=Plan(x, actions)).u)
-    return np.asarray(np.min([replay(swing_up.env_id, states, u, discount).cost for u in plans], axis=0))
 
 
 class Replay(NamedTuple):
