@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any
 
 import lq_plant
 import numpy as np
+import pendulum_data
 import pytest
 import torch
 from hypothesis import given, settings
@@ -52,6 +54,23 @@ def test_an_interrupted_training_ends_with_the_same_bits(options: dict[str, Any]
     second.advance(config.n_steps)
     same_arrays(second.to_arrays(), whole.to_arrays())
     same_arrays(second.result.to_arrays(), whole.result.to_arrays())
+
+
+def test_a_table_larger_than_memory_is_learned_from_and_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "store"))
+    dataset = pendulum_data.stored(episodes=pendulum_data.recorded(length=40, episodes=8))
+    table = TransitionTable.from_minari(dataset, memory=1000, cache=tmp_path / "cache")
+    assert table.is_mapped
+    config = ValueConfig(**TINY, validation=0.3)
+    whole, first, second = (ValueTraining(table, 0.9, config, seed=0) for _ in range(3))
+    whole.advance(30)
+    first.advance(12)
+    second.restore(first.to_arrays())
+    second.advance(18)
+    same_arrays(second.result.to_arrays(), whole.result.to_arrays())
+    assert np.isfinite(whole.result.predict(table.observations)).all()
 
 
 @settings(max_examples=10)
