@@ -40,7 +40,7 @@ SCENES: dict[str, tuple[str, list[float], Controller, int]] = {
 }
 
 
-def main() -> None:
+def main(folder: Path = Path(__file__).parent) -> None:
     """Writes one PNG an environment."""
     for env_id, (name, start, controller, steps) in SCENES.items():
         env = gym.make(f"mpcoffline:{env_id}", render_mode="rgb_array")
@@ -50,7 +50,7 @@ def main() -> None:
             action = np.clip(np.atleast_1d(controller(info["state"])), space.low, space.high)
             _, _, _, _, info = env.step(action.astype(np.float32))
         frame: Any = env.render()
-        pygame.image.save(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), Path(__file__).with_name(f"{name}.png"))
+        pygame.image.save(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), folder / f"{name}.png")
         env.close()
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -173,6 +175,23 @@ def test_the_trail_is_where_the_tip_was_and_ends_with_the_episode() -> None:
     assert abs(before[2] - before[0]) < 5
     env.reset(options={"state": [0.5, 0.0]})
     np.testing.assert_array_equal(env.render(), first)
+
+
+def test_the_pictures_of_the_documentation_are_those_of_today(tmp_path: Path) -> None:
+    folder = Path(__file__).parents[2] / "docs" / "environments"
+    spec = importlib.util.spec_from_file_location("make_pictures", folder / "make_pictures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    script.main(tmp_path)
+    for name in ("pendulum", "cartpole", "linear"):
+        today, kept = (
+            pygame.surfarray.array3d(pygame.image.load(place / f"{name}.png")).astype(int)
+            for place in (tmp_path, folder)
+        )
+        assert np.abs(today - kept).mean() < 1.0  # another version of pygame may draw letters a little differently
+        assert (folder / f"{name}.png").stat().st_size < 60_000
 
 
 # ---------------------------------------------------------------- what can go wrong
