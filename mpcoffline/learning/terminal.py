@@ -15,7 +15,6 @@ import numpy as np
 import scipy.optimize
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
@@ -42,26 +41,18 @@ class DistillConfig:
     Attributes:
         hidden: Widths of the hidden layers.
         max_rows: States that are learned from; a random subset where there are more.
-        outside: States outside the data that are added, as a share of those inside.
-        reach: How far from the data these lie, in standard deviations of the data.
-        slope: Growth of the cost outside the data: spreads of V a standard deviation of the data.
         n_steps: Levenberg-Marquardt steps.
         batch_size: States a step.
     """
 
     hidden: tuple[int, ...] = HIDDEN
     max_rows: int = 50_000
-    outside: float = 0.3
-    reach: float = 2.0
-    slope: float = 0.5
     n_steps: int = 40
     batch_size: int = 4_096
 
     def __post_init__(self) -> None:
         check_integers(1, **{f"hidden[{i}]": width for i, width in enumerate(self.hidden)})
         check_integers(1, max_rows=self.max_rows, n_steps=self.n_steps, batch_size=self.batch_size)
-        for name in ("outside", "reach", "slope"):
-            check_number(name, getattr(self, name), 0.0, open_low=False)
 
 
 @dataclass(frozen=True)
@@ -105,8 +96,8 @@ def fit_terminal(
 
         T = q + (1 - blend) net,        net = argmin E_D[ (V - q - net)^2 ]
 
-    A solver's plans end where no data are. There the network is taught the value at the edge of the data, plus a cost
-    that grows with the distance from it; farther out it saturates, and q decides.
+    Plans may end where no data are. There the network, whose output is bounded, says little, and q decides: the cost
+    grows with the distance from the reference wherever W is not singular.
 
     Args:
         kind: ``"quadratic"`` or ``"network"``.
@@ -141,13 +132,13 @@ def fit_terminal(
     if kind == "quadratic":
         return QuadraticCost(W, x_ref=reference, constant=constant)
 
-    points, wanted = _with_outside(value, states, targets, rng, config)
-    e = points - reference
-    rest = wanted - np.einsum("bi,ij,bj->b", e, W, e) - constant
-    mean, std = states.mean(axis=0), _standard_deviations(states)
+    e = states - reference
+    rest = targets - np.einsum("bi,ij,bj->b", e, W, e) - constant
+    mean, std = states.mean(axis=0), states.std(axis=0)
+    std = np.where(std > _FLAT * (1.0 + np.abs(mean)), std, 1.0)
     offset, scale = float(rest.mean()), float(rest.std()) or 1.0
     weights, biases = fit_network(
-        (points - mean) / std,
+        (states - mean) / std,
         (rest - offset) / scale,
         config.hidden,
         rng=rng,
@@ -233,37 +224,6 @@ def _fit_quadratic(states: Array, x_ref: Array, targets: Array) -> tuple[Array, 
     C = spread**0.5 * found.x.reshape(nx, nx)
     W = (C @ C.T) / np.outer(size, size)
     return W, float(mean_target - (C @ C.T).ravel() @ mean_products)
-
-
-def _with_outside(
-    value: Value, states: Array, targets: Array, rng: np.random.Generator, config: DistillConfig
-) -> tuple[Array, Array]:
-    """The states and their values, and with them points outside the data and what these should cost.
-
-    A point z, in standard deviations, further from its nearest state than states are from each other, is drawn back to
-    that distance, to z_edge; it should cost V(z_edge) + slope |z - z_edge|.
-    """
-    mean, std = states.mean(axis=0), _standard_deviations(states)
-    inside = (states - mean) / std
-    n = round(config.outside * len(states))
-    directions = rng.normal(size=(n, states.shape[1]))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    points = inside[rng.integers(len(inside), size=n)] + config.reach * rng.uniform(size=(n, 1)) * directions
-    tree = cKDTree(inside)
-    some = inside[rng.permutation(len(inside))[:1_000]]
-    spacing = float(np.quantile(tree.query(some, k=min(2, len(inside)))[0], 0.99))
-    distance, nearest = tree.query(points)
-    beyond = np.maximum(distance - spacing, 0.0)
-    inward = (inside[nearest] - points) / np.maximum(distance, spacing or 1.0)[:, None]
-    edge = mean + std * (points + beyond[:, None] * inward)
-    prices = _values(value, edge) + config.slope * targets.std() * beyond
-    return np.concatenate([states, mean + std * points]), np.concatenate([targets, prices])
-
-
-def _standard_deviations(states: Array) -> Array:
-    """The standard deviation of each coordinate ``(nx,)``; one where it is constant."""
-    std = states.std(axis=0)
-    return np.where(std > _FLAT * (1.0 + np.abs(states.mean(axis=0))), std, 1.0)
 
 
 def _check_learned(error: TerminalError) -> None:
