@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -367,18 +368,35 @@ def test_the_model_joins_the_zoo_s_algorithms(monkeypatch: pytest.MonkeyPatch) -
         register_with_rl_zoo()
 
 
-@pytest.mark.interop
-@pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs pip install rl_zoo3")
-def test_the_zoo_s_enjoy_runs_the_model(
-    policy: MPCPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def zoo_arguments(policy: MPCPolicy, tmp_path: Path) -> str:
+    """Of the zoo's programs, for a folder as they know it."""
+    pytest.importorskip("rl_zoo3", reason="needs pip install rl_zoo3")
     register_with_rl_zoo()
-    from rl_zoo3.enjoy import enjoy
-
     name = PENDULUM.replace("/", "-")
     MPCModel(policy).save(tmp_path / "mpc" / f"{name}_1" / name)
-    options = f"--algo mpc --env {PENDULUM} --folder {tmp_path} --gym-packages mpcoffline -n 150 --no-render --seed 3"
+    return f"--algo mpc --env {PENDULUM} --folder {tmp_path} --seed 3"
+
+
+@pytest.mark.interop
+def test_the_zoo_s_enjoy_runs_the_model(
+    policy: MPCPolicy, zoo_arguments: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rl_zoo3.enjoy import enjoy
+
+    options = f"{zoo_arguments} --gym-packages mpcoffline -n 150 --no-render"
     monkeypatch.setattr(sys, "argv", ["enjoy", *options.split()])
     enjoy()
     reported = capsys.readouterr().out
     assert f"Episode Reward: {-evaluate(policy, PENDULUM, 1, seed=3).cost[0]:.2f}\nEpisode Length 100" in reported
+
+
+@pytest.mark.interop
+def test_the_zoo_s_record_video_films_the_model(
+    zoo_arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("moviepy")
+    monkeypatch.setattr(sys, "argv", ["record_video", *f"{zoo_arguments} -n 5 -o {tmp_path}/videos".split()])
+    runpy.run_module("rl_zoo3.record_video", run_name="__main__")
+    (video,) = (tmp_path / "videos").glob("*.mp4")
+    assert video.stat().st_size > 1000
