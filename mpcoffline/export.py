@@ -151,8 +151,8 @@ _HEADER = """\
 @BOUNDS@
  *
  * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
- * one whose warm start led nowhere, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a sixth of
- * them. An iteration costs the same each time, up to the 10 trial steps of its line search.
+ * one whose warm start led nowhere, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a quarter
+ * of them. An iteration costs the same each time, up to the 10 trial steps of its line search.
  */
 #ifndef MPC_CONTROLLER_H
 #define MPC_CONTROLLER_H
@@ -180,8 +180,8 @@ typedef struct {
     int has_plan;
     double x[(MPC_HORIZON + 1) * MPC_NX], u[MPC_HORIZON * MPC_NU];
     double old_x[(MPC_HORIZON + 1) * MPC_NX], old_u[MPC_HORIZON * MPC_NU];
-    double start_x[(MPC_STARTS + 5) / 6][(MPC_HORIZON + 1) * MPC_NX];
-    double start_u[(MPC_STARTS + 5) / 6][MPC_HORIZON * MPC_NU];
+    double start_x[(MPC_STARTS + 3) / 4][(MPC_HORIZON + 1) * MPC_NX];
+    double start_u[(MPC_STARTS + 3) / 4][MPC_HORIZON * MPC_NU];
     double work_x[(MPC_HORIZON + 1) * MPC_NX], work_u[MPC_HORIZON * MPC_NU];
     double work_x_new[(MPC_HORIZON + 1) * MPC_NX], work_u_new[MPC_HORIZON * MPC_NU];
     double work_k[MPC_HORIZON * MPC_NU], work_K[MPC_HORIZON * MPC_NU * MPC_NX];

@@ -13,7 +13,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, StageCost, TerminalCost
 
 from .interface import Array
 
@@ -41,6 +41,17 @@ def is_affine(mpc: MPC) -> bool:
     x, u, theta = _symbols(mpc)
     z = ca.vertcat(x, u)
     return not ca.depends_on(ca.jacobian(mpc.dynamics_function(x, u, theta), z), z)
+
+
+def promises_convexity(cost: StageCost | TerminalCost) -> bool:
+    """Whether a cost's class says by ``convex`` that its Hessian is positive semidefinite for every theta."""
+    return bool(getattr(cost, "convex", False))
+
+
+def is_convex(mpc: MPC) -> bool:
+    """Whether every minimum is global, for every theta: affine model, convex costs, only inputs bounded."""
+    costs = mpc.stage_cost, mpc.terminal_cost
+    return mpc.constraints is None and all(map(promises_convexity, costs)) and is_affine(mpc)
 
 
 def _symbols(mpc: MPC) -> tuple[ca.SX, ca.SX, ca.SX]:

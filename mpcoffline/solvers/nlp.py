@@ -14,7 +14,7 @@ from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, Plan, Solution, Solver
-from .linear_quadratic import is_affine
+from .linear_quadratic import is_convex
 from .starts import N_CANDIDATES, candidate_inputs
 from .transcription import Multipliers, Transcription
 from .workers import WorkerPool
@@ -38,7 +38,7 @@ class IpoptSolver(Solver):
 
     Args:
         mpc: The problem.
-        n_starts: Starting points of a cold solve; 1 suffices where the model is linear (the default there).
+        n_starts: Starting points of a cold solve; by default 4, and 1 where the problem is convex.
         tolerance: ipopt's relative convergence tolerance.
         max_iterations: Bound on the iterations of each ipopt call.
         n_workers: Processes that share a batch (CasADi's threads crash with ipopt). They start with the first batch,
@@ -63,7 +63,7 @@ class IpoptSolver(Solver):
         for name, value in (("max_iterations", max_iterations), ("n_workers", n_workers)):
             if value < 1:
                 raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
-        self._n_starts = n_starts or (1 if is_linear(mpc) else 4)
+        self._n_starts = n_starts or (1 if is_convex(mpc) else 4)
         self._options: dict[str, Any] = {
             "n_starts": self._n_starts,
             "tolerance": tolerance,
@@ -119,11 +119,6 @@ class IpoptSolver(Solver):
         """Ends the worker processes, if there are any; a later batch starts them again."""
         if self._pool is not None:
             self._pool.close()
-
-
-def is_linear(mpc: MPC) -> bool:
-    """Whether f_theta is affine in (x, u) and only inputs are bounded, so that with convex costs minima are global."""
-    return mpc.constraints is None and is_affine(mpc)
 
 
 @dataclass(frozen=True)

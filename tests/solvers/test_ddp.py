@@ -258,7 +258,7 @@ def test_warm_and_cold_agree(env_id: str) -> None:
     np.testing.assert_allclose(again.value, cold.value, rtol=1e-9)
     assert again.stats["iterations"].max() <= 3
     near = solver.solve(x + 1e-3, warm_start=cold)
-    fresh = solver.solve(x + 1e-3)
+    fresh = DDPSolver(solver.mpc, n_starts=16).solve(x + 1e-3)
     assert near.success.all()
     assert (np.abs(near.value / fresh.value - 1.0) < 1e-6).mean() >= 0.9  # else the better of two minima changed
     assert near.stats["iterations"].mean() < 0.2 * fresh.stats["iterations"].mean()

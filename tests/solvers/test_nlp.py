@@ -15,9 +15,9 @@ from scipy.optimize import minimize
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.envs.linear_tracking import A0, ACTION_WEIGHT, B0, STATE_WEIGHT, plant_matrices
 from mpcoffline.errors import InvalidArgumentError
-from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.mpc import MPC, Model, NetworkCost, QuadraticCost
 from mpcoffline.solvers import IpoptSolver, Plan, Solution
-from mpcoffline.solvers.nlp import is_linear
+from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.tasks import nominal_mpc
 
 Array = NDArray[np.float64]
@@ -410,10 +410,11 @@ def test_float32_actions_may_touch_their_bounds() -> None:
     assert IpoptSolver(mpc).solve([1.0], u0=touching).u0[0] == pytest.approx(0.1, abs=1e-12)
 
 
-def test_which_problems_are_linear() -> None:
-    assert is_linear(nominal_mpc(LINEAR))
-    assert is_linear(integrator())
-    assert not is_linear(nominal_mpc(PENDULUM))
+def test_which_problems_are_convex() -> None:
+    assert is_convex(nominal_mpc(LINEAR))
+    assert is_convex(integrator())
+    assert not is_convex(nominal_mpc(PENDULUM))
+    assert not is_convex(integrator(terminal_cost=NetworkCost.random(1, (3,), seed=0)))
 
 
 def test_unbounded_inputs() -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.component import StageCost, TerminalCost
 from mpcoffline.mpc.expressions import Instruction, expanded, instructions
+from mpcoffline.solvers.linear_quadratic import promises_convexity
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
 _FORMATS = {
@@ -87,7 +87,7 @@ def generated(mpc: MPC) -> str:
         "gen_final": _stacked(final),
         "gen_final_expand": _stacked(final_gradient, _triangle(final_hessian)),
     }
-    if not is_convex(mpc.stage_cost):  # then gen_q takes the expansion as the kernel changed it
+    if not promises_convexity(mpc.stage_cost):  # then gen_q takes the expansion as the kernel changed it
         inputs["gen_stage_expand"], outputs["gen_stage_expand"] = [x, u], _stacked(slope, _triangle(hessian))
         stage = ca.SX.sym("stage", outputs["gen_stage_expand"].numel())
         inputs["gen_q"].append(stage)
@@ -95,7 +95,7 @@ def generated(mpc: MPC) -> str:
     outputs["gen_q"] = _action_value(reached, slope, hessian, x, u, following, gradient, curvature, discount)
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
-    convex = int(is_convex(mpc.stage_cost)), int(is_convex(mpc.terminal_cost))
+    convex = int(promises_convexity(mpc.stage_cost)), int(promises_convexity(mpc.terminal_cost))
     parts = [
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
@@ -103,11 +103,6 @@ def generated(mpc: MPC) -> str:
         *(emit(name, [*inputs[name], parameters], body) for name, body in zip(outputs, bodies, strict=True)),
     ]
     return "\n\n".join(parts)
-
-
-def is_convex(cost: StageCost | TerminalCost) -> bool:
-    """Whether a cost promises a positive semidefinite Hessian for every theta, by an attribute ``convex``."""
-    return bool(getattr(cost, "convex", False))
 
 
 def _action_value(

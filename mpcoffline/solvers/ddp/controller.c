@@ -22,8 +22,8 @@ static void keep(mpc_state *state, const lanes *w) {
     for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->x[i] = w->x[i];
 }
 
-/* Solves from the MPC_STARTS cheapest candidates: a few iterations each, the best go on, the best solution is kept.
- * Returns whether there is one. */
+/* Solves from MPC_STARTS starts, each the cheapest of its share of the candidates: a few iterations each, the best go
+ * on, the best solution is kept. Returns whether there is one. */
 static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     double J[N_CANDIDATES], lead[FINALISTS(MPC_STARTS)], best = INFINITY;
     int best_converged = 0;
@@ -36,10 +36,9 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
         if (!(J[c] < INFINITY)) J[c] = INFINITY;
     }
     for (int start = 0; start < MPC_STARTS; ++start) {
-        int cheapest = 0, place = start;
-        for (int c = 1; c < N_CANDIDATES; ++c)
+        int cheapest = start * N_CANDIDATES / MPC_STARTS, place = start;
+        for (int c = cheapest; c < (start + 1) * N_CANDIDATES / MPC_STARTS; ++c)
             if (J[c] < J[cheapest]) cheapest = c;
-        J[cheapest] = INFINITY;
         for (int k = 0; k < MPC_HORIZON; ++k)
             for (int a = 0; a < NU; ++a)
                 w->u[k * NU + a] = clip(candidate(cheapest, k, a), m->low[a], m->high[a]);

@@ -32,7 +32,7 @@ enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING 
 #define INPUT_TOLERANCE 3e-5
 #define RIDGE 1e-12   /* keeps a singular Quu (an input that nothing depends on) invertible */
 #define RACE_ITERATIONS 4                 /* of each start of a cold solve, before the best go on */
-#define FINALISTS(starts) (((starts) + 5) / 6)
+#define FINALISTS(starts) (((starts) + 3) / 4)
 #define NT (NX * (NX + 1) / 2)
 #define NZ (NX + NU)
 #define TRI(i, j) ((j) * ((j) + 1) / 2 + (i)) /* of an upper triangle, i <= j */

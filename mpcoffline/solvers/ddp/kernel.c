@@ -153,7 +153,8 @@ static void swap(double *a, double *b, int64_t n) {
     }
 }
 
-/* Cold solve of one problem from the cheapest candidates; the best solution goes to row i of the batch. */
+/* Cold solve of one problem. Each start is the cheapest of its share of the candidates, which keeps them different;
+ * the best solution goes to row i of the batch. */
 static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
                       int64_t n_candidates, double *J, lanes *w, mpc_batch *starts) {
     int64_t N = m->horizon, best = 0;
@@ -161,10 +162,9 @@ static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const
     starts->theta = b->theta + i * b->theta_stride;
     candidate_costs(m, w, b->x0 + i * NX, starts->theta, u0, candidates, n_candidates, J);
     for (int64_t l = 0; l < starts->n; ++l) {
-        int64_t cheapest = 0;
-        for (int64_t c = 1; c < n_candidates; ++c)
+        int64_t cheapest = l * n_candidates / starts->n;
+        for (int64_t c = cheapest; c < (l + 1) * n_candidates / starts->n; ++c)
             if (J[c] < J[cheapest]) cheapest = c;
-        J[cheapest] = INFINITY;
         memcpy(starts->u + l * N * NU, candidates + cheapest * N * NU, N * NU * sizeof(double));
         memcpy((double *)starts->x0 + l * NX, b->x0 + i * NX, NX * sizeof(double));
         if (u0) memcpy((double *)starts->u0 + l * NU, u0, NU * sizeof(double));

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import Array, Plan, Solution, Solver
+from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
 
 from .build import compiled
@@ -60,11 +61,13 @@ class DDPSolver(Solver):
     """Control-limited differential dynamic programming with Gauss-Newton Hessians, eight problems an instruction.
 
     Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
-    and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. A cold
-    problem is solved from the 16 cheapest of 64 fixed input sequences, the best three of which go on after four
-    iterations, and the best solution is kept; a warm one from its plan, which need not obey the model. Every result is
-    a rollout of the model, so the dynamics hold exactly; ``success`` says that the quadratic model at it promises no
-    further decrease and that the first input has settled.
+    and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. Costs whose
+    class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian.
+
+    A cold problem is solved from 16 of 64 fixed input sequences, each the cheapest of four that are alike; the best
+    four go on after four iterations, and the best solution is kept. A warm one is solved from its plan, which need not
+    obey the model. Every result is a rollout of the model, so the dynamics hold exactly; ``success`` says that the
+    quadratic model at it promises no further decrease and that the first input has settled.
 
     References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 
@@ -72,7 +75,7 @@ class DDPSolver(Solver):
         mpc: The problem; without constraints other than input bounds.
         max_iterations: Bound on the iterations of a problem.
         tolerance: Predicted decrease of the cost, relative to 1 + |V|, below which a problem is solved.
-        n_starts: Starting points of a cold solve.
+        n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
         n_threads: Threads that share a batch; a batch of up to eight problems uses one.
 
     Raises:
@@ -89,7 +92,7 @@ class DDPSolver(Solver):
         *,
         max_iterations: int = 200,
         tolerance: float = 1e-11,
-        n_starts: int = 16,
+        n_starts: int | None = None,
         n_threads: int = 1,
     ) -> None:
         super().__init__(mpc)
@@ -103,6 +106,8 @@ class DDPSolver(Solver):
         for name, value in (("max_iterations", max_iterations), ("n_threads", n_threads)):
             if value < 1:
                 raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
+        if n_starts is None:
+            n_starts = 1 if is_convex(mpc) else 16
         if not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
         library = compiled(source(mpc))
