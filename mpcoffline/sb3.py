@@ -69,9 +69,7 @@ class MPCModel(BaseAlgorithm):
         self.policy, self.n_envs = policy, 1
         self.observation_space, self.action_space = policy.observation_space, policy.action_space
         if env is not None:
-            made = maybe_make_env(env, verbose)
-            assert made is not None  # noqa: S101 -- None comes from None alone; narrows the type
-            self.set_env(made)
+            self.set_env(maybe_make_env(env, verbose))
         if seed is not None:
             self.policy.set_random_seed(seed)
 
@@ -220,7 +218,14 @@ def _read_policy(path: Path) -> MPCPolicy:
 
 
 def _check_spaces(policy: MPCPolicy, env: VecEnv) -> None:
-    """Refuses an environment that the policy was not made for."""
+    """Refuses an environment that the policy was not made for, or cannot act in."""
+    if any(env.env_is_wrapped(gym.wrappers.NormalizeObservation)):
+        raise InvalidArgumentError(
+            "env",
+            expected="observations in their units, or normalised by SB3's VecNormalize",
+            actual="gymnasium.wrappers.NormalizeObservation",
+            hint="Its statistics are out of an MPC's reach.",
+        )
     for name in ("observation_space", "action_space"):
         own, given = getattr(policy, name), getattr(env, name)
         same_shape = isinstance(given, spaces.Box) and given.shape == own.shape
@@ -254,9 +259,7 @@ class EnvironmentEvaluator:
     def __init__(self, env: gym.Env[Any, Any] | VecEnv | str, n_episodes: int = 10, *, seed: int = 0) -> None:
         if n_episodes < 1:
             raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
-        made = maybe_make_env(env, verbose=0)
-        assert made is not None  # noqa: S101 -- None comes from None alone; narrows the type
-        self._env = BaseAlgorithm._wrap_env(made)
+        self._env = MPCModel._wrap_env(maybe_make_env(env, verbose=0))
         self._n_episodes, self._seed = n_episodes, seed
 
     def __call__(self, learner: OfflineMPCLearner, table: TransitionTable) -> float:

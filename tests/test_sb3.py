@@ -162,6 +162,12 @@ def test_a_policy_that_knows_no_bounds_takes_any_environment_of_its_shape() -> N
     assert MPCModel(MPCPolicy(short_pendulum()), make_env()).observation_space == make_env().observation_space
 
 
+def test_observations_normalised_by_gymnasium_are_refused() -> None:
+    policy = MPCPolicy(short_pendulum())
+    with pytest.raises(InvalidArgumentError, match=r"env: .* in their units, or .* got gymnasium\.wrappers\.Normalize"):
+        MPCModel(policy, gym.wrappers.NormalizeObservation(make_env()))
+
+
 def test_learning_is_refused_by_naming_who_learns(policy: MPCPolicy) -> None:
     with pytest.raises(MPCOfflineError, match=r"OfflineMPCLearner\(mpc\)\.fit\(dataset\)"):
         MPCModel(policy).learn(1000)
