@@ -50,8 +50,8 @@ def promises_convexity(cost: StageCost | TerminalCost) -> bool:
 
 def is_convex(mpc: MPC) -> bool:
     """Whether every minimum is global, for every theta: affine model, convex costs, only inputs bounded."""
-    costs = mpc.stage_cost, mpc.terminal_cost
-    return mpc.constraints is None and all(map(promises_convexity, costs)) and is_affine(mpc)
+    costs = promises_convexity(mpc.stage_cost) and promises_convexity(mpc.terminal_cost)
+    return mpc.constraints is None and costs and is_affine(mpc)
 
 
 def _symbols(mpc: MPC) -> tuple[ca.SX, ca.SX, ca.SX]:

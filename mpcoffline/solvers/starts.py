@@ -43,4 +43,4 @@ def _switching(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.b
     so_far = (switches[:, :, None] <= np.arange(segments)[None, None, :, None]).sum(axis=1)
     first = rng.integers(0, 2, size=(n, 1, nu))
     order = np.lexsort((so_far[:, -1].sum(axis=1), first[:, 0, 0]))
-    return ((so_far + first) % 2 == 1)[order]
+    return np.asarray((so_far + first) % 2 == 1)[order]
