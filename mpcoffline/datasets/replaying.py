@@ -155,7 +155,8 @@ def replay(
 
     Raises:
         UnknownIdError: For an unknown data set, or an environment that is neither registered nor may be imported.
-        InvalidDataError: Without ``infos/state`` or an environment, or where that takes no state to start from.
+        InvalidDataError: Without ``infos/state`` or an environment, or where that takes no state to start from, or has
+            noise.
         InvalidArgumentError: For ``n_episodes`` < 1 or an unknown quantity.
     """
     if n_episodes is not None and n_episodes < 1:
@@ -166,6 +167,12 @@ def replay(
     if isinstance(dataset, str):
         dataset = load_dataset(dataset)
     env = recover_environment(dataset, allow_import=allow_import)
+    if isinstance(env.unwrapped, ControlTask) and env.unwrapped.noisy:
+        raise InvalidDataError(
+            f"data set {dataset.spec.dataset_id!r}",
+            expected="an environment without noise, which alone can be simulated again",
+            actual=f"{dataset.env_spec.id if dataset.env_spec else env} with process or measurement noise",
+        )
     indices = dataset.episode_indices
     if n_episodes is not None and n_episodes < len(indices):
         indices = indices[np.linspace(0, len(indices) - 1, n_episodes).round().astype(int)]

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from pendulum_data import PENDULUM, recorded, stored
 from rich.console import Console
 
+from mpcoffline.datasets.minari_store import write_dataset
 from mpcoffline.datasets.replaying import recover_environment, replay
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
@@ -131,6 +132,20 @@ def test_a_changed_shape_is_an_infinite_deviation() -> None:
     report = replay(stored(episodes=[replace(episodes[0], observations=wide)], observation_space=space))
     assert report.free_run["observation"].absolute == math.inf
     assert not report.ok
+
+
+@pytest.mark.parametrize("noise", ["process_noise", "measurement_noise"])
+def test_noise_cannot_be_simulated_again(noise: str) -> None:
+    env = gym.make(PENDULUM, **{noise: 0.01})
+    dataset = write_dataset(
+        "test/noisy-v0",
+        recorded(**{noise: 0.01}),
+        env_spec=env.spec,
+        observation_space=env.observation_space,
+        action_space=env.action_space,
+    )
+    with pytest.raises(InvalidDataError, match="expected an environment without noise"):
+        replay(dataset)
 
 
 def test_what_cannot_be_replayed_says_why() -> None:
