@@ -227,7 +227,7 @@ def identify(
     table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     problem = OneStepProblem(mpc, _rows(mpc, table, config, rng))
-    rows, unwrapped = _unwrapped(problem.rows, problem.errors(mpc.theta) * problem.scale)
+    rows, unwrapped = without_jumps(problem.rows, problem.errors(mpc.theta) * problem.scale)
     if unwrapped:
         problem = OneStepProblem(mpc, rows)
     if not problem.free.size:
@@ -287,8 +287,8 @@ def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: n
     return Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
 
 
-def _unwrapped(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
-    """S+ with full turns removed in the coordinates that are wrapped angles.
+def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
+    """The rows with full turns removed from s+ in wrapped angles, and which coordinates these are.
 
     These are confined to one turn, and their prediction errors are either small or near a full turn.
     """

@@ -1,0 +1,186 @@
+"""May I trust this fit? Everything that the log can say about a learned MPC, and a verdict."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.errors import MPCOfflineError
+from mpcoffline.learner import OfflineMPCLearner
+from mpcoffline.learning import ValueFunction
+from mpcoffline.learning.checks import check_integers
+from mpcoffline.learning.smoothing import SmoothedIdentification, identify_smoothed
+from mpcoffline.mpc import MPC
+from mpcoffline.policy import MPCPolicy
+
+from .ensemble import Ensemble
+from .logged_cost import LoggedCost
+from .measures import (
+    bound_names,
+    fit_errors,
+    goal_share,
+    lag_check,
+    one_step_error,
+    outside_support,
+    predicted_states,
+    reference_of,
+    returns_of,
+    value_check,
+)
+from .report import PredictionCheck, Report, Traces
+from .simulation import Simulation, initial_states, simulate
+from .stability import TheoremCheck, closed_loop_eigenvalues, value_growth, weight_checks
+from .verdict import Comparison, decide
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+Array = NDArray[np.float64]
+
+_SCARCE_GOAL = 1e-3
+_BLIND_VALUE = 0.3
+_WORSE_MODEL = 2.0
+
+
+def diagnose(
+    learner: OfflineMPCLearner,
+    dataset: MinariDataset | TransitionTable | str,
+    *,
+    n_starts: int = 20,
+    n_steps: int = 100,
+    seed: int = 0,
+) -> Report:
+    """Diagnoses a fit from the log alone.
+
+    Both controllers, MPC_1 and the learned one, are simulated on an ensemble of models identified from the log (see
+    :class:`~mpcoffline.diagnostics.ensemble.Ensemble`), from initial states of the log, with a stage cost learned from
+    the logged costs (:class:`~mpcoffline.diagnostics.logged_cost.LoggedCost`). That decides the verdict
+    (:func:`~mpcoffline.diagnostics.verdict.decide`); all else is reported beside it.
+
+    Example:
+        >>> report = mpcoffline.diagnose(learner, "mpcoffline/pendulum/ddpg-v0")
+        >>> print(report)
+        >>> report.figure("diagnosis.pdf")
+
+    Args:
+        learner: A fitted learner.
+        dataset: What it was fitted on, or another log of the same plant.
+        n_starts: Episodes simulated on each model.
+        n_steps: Their length.
+        seed: Seeds the ensemble and the choice of starts.
+
+    Returns:
+        The report.
+
+    Raises:
+        MPCOfflineError: If the learner was not fitted.
+        InvalidDataError: If the data have other dimensions than the MPC.
+    """
+    check_integers(1, n_starts=n_starts, n_steps=n_steps)
+    nominal, learned = learner.nominal_mpc, learner.mpc
+    if learner.value_function is None:
+        raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
+    table = _table_of(dataset)
+    found = identify_smoothed(nominal, table, seed=seed)
+    clean, identified = found.table, nominal.with_theta(found.identification.theta)
+    ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
+    cost = LoggedCost(clean, seed)
+    starts = initial_states(clean, n_starts, seed)
+    policies = MPCPolicy(nominal), MPCPolicy(learned)
+    first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
+    comparison = Comparison.of(first, second, cost.r2)
+    lag = lag_check(identified, table)
+    verdict, reasons = decide(comparison, lag, found.noise, len(table))
+    reference = reference_of(learned)
+    report = Report(
+        verdict=verdict,
+        reasons=reasons,
+        notes=(),
+        comparison=comparison,
+        value=value_check(learner.value_function, clean, learned.discount),
+        fit=fit_errors(nominal, learned, learner.value_function, clean, learner.result),
+        prediction=_prediction(nominal, identified, learned, found),
+        theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
+        weights=weight_checks(nominal, learned),
+        at_bounds=bound_names(learned, nominal),
+        outside_support=outside_support(clean, predicted_states(learned, clean)),
+        lag=lag,
+        noise=found.noise,
+        goal_share=None if reference is None else goal_share(clean, reference),
+        n_rows=len(table),
+        n_episodes=table.n_episodes,
+        traces=Traces(
+            first.states,
+            second.states,
+            np.stack(returns_of(learner.value_function, clean, learned.discount)),
+            reference,
+        ),
+    )
+    return report.with_notes(_notes(report))
+
+
+def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:
+    before, best, after = (one_step_error(mpc, found.table) for mpc in (nominal, identified, learned))
+    return PredictionCheck(before, best, after, found.identification.undetermined)
+
+
+def _theorem(
+    learned: MPC,
+    policy: MPCPolicy,
+    value: ValueFunction,
+    table: TransitionTable,
+    simulation: Simulation,
+    reference: Array | None,
+) -> TheoremCheck:
+    """The condition of Theorem 1, along rollouts on the identified model."""
+    states = simulation.states.reshape(-1, learned.nx)
+    return TheoremCheck(
+        value_growth(value, table, states, bool(simulation.lost[0].any())),
+        outside_support(table, states),
+        () if reference is None else closed_loop_eigenvalues(learned, policy.solver, table, reference),
+    )
+
+
+def _notes(report: Report) -> tuple[str, ...]:
+    """What explains the verdict or may spoil the next fit, with what to do."""
+    notes = []
+    if report.goal_share is not None and report.goal_share < _SCARCE_GOAL:
+        notes.append("The log never reaches the goal: V is a guess there. Record episodes that end at the reference.")
+    if not report.noise.negligible:
+        notes.append(
+            f"Measurement noise of {report.noise.level:.1%}: states were smoothed here. Fit with init='identified',"
+            " which does the same."
+        )
+    if report.value.n and report.value.correlation < _BLIND_VALUE:
+        notes.append("V hardly follows the measured returns: learn it longer, or by another method.")
+    if report.prediction.learned > _WORSE_MODEL * report.prediction.identified + 0.01:
+        factor = report.prediction.learned / max(report.prediction.identified, 1e-12)
+        notes.append(
+            f"The learned model predicts {factor:.1f} times worse than the identified one: Theorem 1 allows that, but"
+            " init='identified' is the safer start."
+        )
+    if report.prediction.undetermined:
+        notes.append(
+            f"The data do not determine {', nor '.join(report.prediction.undetermined)}: vary the inputs more."
+        )
+    if report.at_bounds:
+        notes.append(f"On a bound: {', '.join(report.at_bounds)}. Widen it if the physics allow, or raise the prior.")
+    if report.theorem.value_growth > 1.5:
+        notes.append(
+            "V grows along the model's rollouts beyond anything in the data: Theorem 1's condition is doubtful."
+        )
+    if report.theorem.eigenvalues and report.theorem.eigenvalues[0] > 1.0 + 1e-3:
+        notes.append("The learned closed loop is unstable at the reference, on its own model: do not use it there.")
+    for weight in report.weights:
+        if weight.after[0] < 1e-6 * max(weight.after[-1], 1e-300) and weight.before[0] > 1e-6 * weight.before[-1]:
+            notes.append(
+                f"{weight.name} has lost a direction (smallest eigenvalue 0): raise the prior if that one matters."
+            )
+    return tuple(notes)
+
+
+def _table_of(dataset: MinariDataset | TransitionTable | str) -> TransitionTable:
+    return dataset if isinstance(dataset, TransitionTable) else TransitionTable.from_minari(dataset)

@@ -1,0 +1,174 @@
+"""What :func:`mpcoffline.diagnose` returns: figures, a verdict, and the reasons, as text, JSON and a picture."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.learning.smoothing import NoiseEstimate
+
+from .measures import LagCheck, RegionError, ValueCheck
+from .stability import TheoremCheck, WeightCheck
+from .verdict import Comparison, Verdict
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PredictionCheck:
+    """One-step prediction errors, every coordinate in the spread of its increments (root mean squares).
+
+    Attributes:
+        nominal: Of MPC_1's model.
+        identified: Of the model with the smallest error: what this model structure can do.
+        learned: Of the learned MPC's model.
+        undetermined: Parameters, or combinations, that the data do not determine.
+    """
+
+    nominal: float
+    identified: float
+    learned: float
+    undetermined: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Traces:
+    """What the figure shows besides.
+
+    Attributes:
+        nominal_states: MPC_1 on the identified model, ``(starts, T + 1, nx)``.
+        learned_states: The learned MPC, likewise.
+        value: V of some logged states and the return measured from each, ``(2, n)``.
+        goal: The reference, ``(nx,)``, where there is one.
+    """
+
+    nominal_states: Array = field(repr=False)
+    learned_states: Array = field(repr=False)
+    value: Array = field(repr=False)
+    goal: Array | None = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Report:
+    """May this fit be trusted?
+
+    Only the simulations decide the verdict; the other figures explain it, and rank fits badly on their own.
+
+    Attributes:
+        verdict: ``"recommend"``, ``"try with care"`` or ``"keep MPC_1"``.
+        reasons: Why, and what to do; the decisive one first.
+        notes: What else the user should know, and what to do about it.
+        comparison: Both controllers on an ensemble of models identified from the log.
+        value: V_phi against measured returns.
+        fit: The regression error of (FIT) before and after, by region.
+        prediction: One-step prediction errors.
+        theorem: The condition of Theorem 1.
+        weights: Eigenvalues of W and R.
+        at_bounds: Learned parameters on a bound.
+        outside_support: Share of f_theta(s, a), over the logged (s, a), outside the data's support.
+        lag: Whether inputs act late.
+        noise: Measurement and process noise.
+        goal_share: Share of the logged states near the reference; None without reference.
+        n_rows: Transitions.
+        n_episodes: Episodes.
+        traces: What the figure shows besides; not in the JSON form.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+    comparison: Comparison
+    value: ValueCheck
+    fit: tuple[RegionError, ...]
+    prediction: PredictionCheck
+    theorem: TheoremCheck
+    weights: tuple[WeightCheck, ...]
+    at_bounds: tuple[str, ...]
+    outside_support: float
+    lag: LagCheck
+    noise: NoiseEstimate
+    goal_share: float | None
+    n_rows: int
+    n_episodes: int
+    traces: Traces = field(repr=False, compare=False)
+
+    def __str__(self) -> str:
+        """The report as plain text."""
+        c, p, ratios = self.comparison, self.prediction, np.array(self.comparison.ratios)
+        lines = [f"Verdict: {self.verdict}", *(f"  - {reason}" for reason in self.reasons)]
+        if self.notes:
+            lines += ["Notes", *(f"  - {note}" for note in self.notes)]
+        rows = [
+            ("data", f"{self.n_rows} rows, {self.n_episodes} episodes"),
+            ("models, starts, steps", f"{len(ratios)}, {c.n_starts}, {c.n_steps}"),
+            ("cost relative to MPC_1", f"{ratios[0]:.3f} identified, {ratios.min():.3f} to {ratios.max():.3f} all"),
+            ("episodes that end well", f"{c.nominal_success[0]:.0%} MPC_1, {c.learned_success[0]:.0%} learned"),
+            ("R2 of the simulated cost", f"{c.cost_r2:.4f}"),
+            ("V against returns", self._value_text()),
+            *((f"(FIT) error, {part.name}", f"{part.before:.3g} before, {part.after:.3g} after") for part in self.fit),
+            ("one-step error", f"{p.nominal:.3g} MPC_1, {p.identified:.3g} identified, {p.learned:.3g} learned"),
+            ("f(s,a) outside the data", f"{self.outside_support:.1%}"),
+            ("V along model rollouts", f"{self.theorem.value_growth:.2f} of its range in the data"),
+            ("rollouts outside the data", f"{self.theorem.outside:.1%}"),
+            ("closed-loop eigenvalues", _numbers(self.theorem.eigenvalues) or "unknown"),
+            *((f"eigenvalues of {w.name}", f"{_numbers(w.before)} before, {_numbers(w.after)} after")
+              for w in self.weights),
+            ("parameters at bounds", ", ".join(self.at_bounds) or "none"),
+            ("measurement noise", f"{self.noise.level:.1%} of the states' spread ({self.noise.source})"),
+            ("effect of past inputs", f"{self.lag.share:.1%} of the present one's"),
+            ("logged states near the goal", "unknown" if self.goal_share is None else f"{self.goal_share:.2%}"),
+        ]  # fmt: skip
+        width = max(len(name) for name, _ in rows)
+        return "\n".join([*lines, "Figures", *(f"  {name:<{width}}  {text}" for name, text in rows)])
+
+    def with_notes(self, notes: tuple[str, ...]) -> Report:
+        """The same report with notes."""
+        return replace(self, notes=notes)
+
+    def _value_text(self) -> str:
+        v = self.value
+        if not v.n:
+            return "no episode is long enough"
+        return f"rank correlation {v.correlation:.2f}, bias {v.bias:+.2f} std, above {v.above:.0%} ({v.n} returns)"
+
+    def to_json(self) -> str:
+        """The report as JSON text; what is not finite becomes null."""
+        data = {name: value for name, value in asdict(self).items() if name != "traces"}
+        data["comparison"] |= {"ratios": list(self.comparison.ratios), "limit": self.comparison.limit}
+        data["noise"] |= {"level": self.noise.level}
+        return json.dumps(_plain(data), indent=2, allow_nan=False)
+
+    def figure(self, path: str | PathLike[str]) -> list[Path]:
+        """Draws the report.
+
+        Args:
+            path: Where; PDF and PNG are written, whatever the suffix.
+
+        Returns:
+            The files.
+        """
+        from .figure import draw
+
+        return draw(self, Path(path).with_suffix(""))
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, texts, lists and dictionaries of what dataclasses hold."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

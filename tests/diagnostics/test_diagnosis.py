@@ -1,0 +1,136 @@
+"""Whole diagnoses of small linear fits whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import lq_plant
+import numpy as np
+import pytest
+from lq_episodes import episodes
+from lq_plant import QuadraticValue
+
+import mpcoffline
+from mpcoffline import OfflineMPCLearner, TransitionTable
+from mpcoffline.diagnostics import Report, diagnose
+from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
+from mpcoffline.learning.smoothing import with_measurement_noise
+from mpcoffline.mpc import MPC
+
+LOG = episodes(n=40, steps=40)
+# An engineer who believes that inputs act the other way.
+WRONG = lq_plant.make_mpc((lq_plant.A, -0.5 * lq_plant.B))
+
+
+def fitted(mpc: MPC, table: TransitionTable = LOG) -> OfflineMPCLearner:
+    value = QuadraticValue(lq_plant.BEST.P)
+    learner = OfflineMPCLearner(mpc, preset="paper", init="identified", value_function=value, fit_n_steps=1, trim=1.0)
+    learner.fit(table, show_progress=False)
+    return learner
+
+
+@pytest.fixture(scope="module")
+def good() -> Report:
+    return diagnose(fitted(WRONG), LOG, n_starts=8, n_steps=40)
+
+
+def test_a_fit_that_repairs_a_wrong_model_is_recommended(good: Report) -> None:
+    assert good.verdict == "recommend"
+    assert max(good.comparison.ratios) < 0.5
+    assert good.prediction.identified < 1e-5 < good.prediction.nominal
+    assert good.theorem.eigenvalues[0] < 1.0
+    assert good.value.correlation > 0.5
+    assert good.fit[0].after < good.fit[0].before
+    assert good.noise.negligible
+    assert not good.lag.found
+    assert good.at_bounds == ()
+    assert good.goal_share is not None
+    assert good.goal_share > 0.01
+    assert (good.n_rows, good.n_episodes) == (1_600, 40)
+
+
+def test_text_and_json_say_the_same(good: Report) -> None:
+    text, data = str(good), json.loads(good.to_json())
+    assert text.startswith("Verdict: recommend\n  - Better on models of your data")
+    assert data["verdict"] == "recommend"
+    assert data["comparison"]["ratios"] == pytest.approx(good.comparison.ratios)
+    assert data["theorem"]["eigenvalues"] == pytest.approx(good.theorem.eigenvalues)
+    assert "traces" not in data
+    assert f"{good.comparison.ratios[0]:.3f} identified" in text
+    assert all(len(line) < 200 for line in text.splitlines())
+
+
+def test_the_figure_is_drawn(good: Report, tmp_path: Path) -> None:
+    files = good.figure(tmp_path / "report.png")
+    assert [file.name for file in files] == ["report.pdf", "report.png"]
+    assert all(file.stat().st_size > 10_000 for file in files)
+    again = good.figure(tmp_path / "again")
+    assert again[0].read_bytes() == files[0].read_bytes()
+
+
+def test_the_same_seed_gives_the_same_report(good: Report) -> None:
+    assert diagnose(fitted(WRONG), LOG, n_starts=8, n_steps=40).to_json() == good.to_json()
+
+
+def test_where_nothing_can_be_gained_mpc_1_is_kept() -> None:
+    report = diagnose(fitted(lq_plant.make_mpc((lq_plant.A, lq_plant.B))), LOG, n_starts=8, n_steps=40)
+    assert report.verdict == "keep MPC_1"
+    assert report.comparison.ratios[0] == pytest.approx(1.0, abs=0.02)
+    assert "No clear gain" in report.reasons[0]
+
+
+def test_late_inputs_withhold_the_recommendation() -> None:
+    late = episodes(n=40, steps=40, lag=1)
+    report = diagnose(fitted(WRONG, late), late, n_starts=5, n_steps=30)
+    assert report.lag.found
+    assert report.verdict != "recommend"
+    assert any("late" in reason for reason in report.reasons)
+
+
+def test_noise_and_a_log_without_the_goal_are_noted() -> None:
+    noisy = with_measurement_noise(LOG, 0.05, 0)
+    far = WRONG.with_theta(WRONG.space.pack({"stage_cost.x_ref": [9.0, 0.0]}))
+    report = diagnose(fitted(far, noisy), noisy, n_starts=3, n_steps=10)
+    assert report.noise.level == pytest.approx(0.05, rel=0.15)
+    assert any("noise" in note for note in report.notes)
+    assert any("never reaches the goal" in note for note in report.notes)
+    assert "never reaches the goal" in str(report)
+
+
+def test_a_short_single_episode_gives_a_report_without_nan() -> None:
+    table = TransitionTable(LOG.rows[:30], LOG.ny, LOG.nu, np.zeros(30, dtype=np.int64))
+    report = diagnose(fitted(WRONG, table), table, n_starts=3, n_steps=10)
+    assert report.value.n == 0
+    assert np.isfinite(report.comparison.ratios).all()
+    assert "no episode is long enough" in str(report)
+    json.loads(report.to_json())
+
+
+def test_what_cannot_be_diagnosed_is_refused() -> None:
+    with pytest.raises(MPCOfflineError, match="fit"):
+        diagnose(OfflineMPCLearner(WRONG, preset="paper"), LOG)
+    learner = fitted(WRONG)
+    with pytest.raises(InvalidArgumentError, match="n_starts"):
+        diagnose(learner, LOG, n_starts=0)
+    pendulum = TransitionTable.from_arrays(
+        np.zeros((5, 3)), np.zeros((5, 1)), np.zeros(5), np.zeros((5, 3)), np.zeros(5)
+    )
+    with pytest.raises(InvalidDataError, match="observations"):
+        diagnose(learner, pendulum)
+
+
+@pytest.mark.slow
+def test_a_swing_up_is_diagnosed() -> None:
+    from mpcoffline.learning import ValueConfig, fit_value
+
+    table = TransitionTable.from_minari("mpcoffline/pendulum/ddpg-v0")
+    part = TransitionTable(table.rows[40_000:], table.ny, table.nu, table.episode_ids[40_000:])
+    mpc = mpcoffline.nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.5, seed=1)
+    value = fit_value(part, 0.95, ValueConfig(method="expectile", n_steps=500), seed=0)
+    learner = OfflineMPCLearner(mpc, preset="default", terminal="quadratic", value_function=value)
+    learner.fit(part, show_progress=False)
+    report = diagnose(learner, part, n_starts=6)
+    assert report.verdict == "recommend"
+    assert report.comparison.cost_r2 > 0.99
+    assert len(report.theorem.eigenvalues) == 2  # the radius is no motion of the plant
