@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         StateBounds,
     )
     from mpcoffline.policy import MPCPolicy
+    from mpcoffline.sb3 import MPCModel
     from mpcoffline.solvers import make_solver
     from mpcoffline.tasks import nominal_mpc
 
@@ -58,6 +59,7 @@ _HOMES = {
     "QuadraticCost": "mpc",
     "StateBounds": "mpc",
     "make_solver": "solvers",
+    "MPCModel": "sb3",
     "MPCPolicy": "policy",
     "OfflineMPCLearner": "learner",
     "nominal_mpc": "tasks",
@@ -84,6 +86,7 @@ __all__ = [
     "InvalidDataError",
     "LiftedCost",
     "MPCOfflineError",
+    "MPCModel",
     "MPCPolicy",
     "MinariRecorder",
     "Model",

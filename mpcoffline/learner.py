@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 Learn = Literal["cost", "cost+model"]
 #: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
 Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
-#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch.
-Callback = Callable[["OfflineMPCLearner", int, int], None]
+#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False ends the fit there.
+Callback = Callable[["OfflineMPCLearner", int, int], bool | None]
 
 _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
 
@@ -59,7 +59,8 @@ class OfflineMPCLearner:
             the published recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon,
             ``"best"`` the longest.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
-        value: Name of a value method, e.g. ``"expectile"``; overrides the preset.
+        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"`` or ``"auto"``; overrides the
+            preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
         device: Torch device for (VALUE).
         **overrides: Any field of :class:`~mpcoffline.presets.LearnerConfig`, ``ValueConfig`` or ``FitConfig``, e.g.
@@ -122,8 +123,9 @@ class OfflineMPCLearner:
             n_steps_per_epoch: Steps between entries of the history; 500 in (VALUE) and 100 in (FIT) by default.
             evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
                 one of (FIT) on, when there is a policy.
-            callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch;
-                :mod:`mpcoffline.loggers` has those that write CSV files and TensorBoard events.
+            callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch; one that returns
+                False ends the fit. :mod:`mpcoffline.loggers` has those that write CSV files and TensorBoard events,
+                :mod:`mpcoffline.sb3` one that runs SB3's.
             checkpoint: A file that is written at the end of each epoch. Where it exists, the fit goes on from it and
                 ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
@@ -187,12 +189,13 @@ class OfflineMPCLearner:
                     metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
                 history.append((len(history) + 1, metrics))
                 self.history = history
-                for callback in callbacks:
-                    callback(self, len(history), epoch.total_step)
+                stop = any([callback(self, len(history), epoch.total_step) is False for callback in callbacks])
                 if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
                     saved.write(fit, history)
                 progress.show(epoch)
                 yield history[-1]
+                if stop:
+                    return
 
     @property
     def mpc(self) -> MPC:

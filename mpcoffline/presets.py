@@ -98,7 +98,7 @@ _DEFAULT = LearnerConfig(
     terminal="network",
     terminal_blend=0.5,
     init="identified",
-    value=ValueConfig(method="expectile"),
+    value=ValueConfig(method="auto", tau=0.1, n_steps=3_000, learning_rate=2e-3, polyak=0.02),
     fit=FitConfig(n_steps=0),
 )
 

@@ -285,33 +285,31 @@ class SB3Callback:
         env: What it sees as ``training_env``; by default its ``eval_env`` where it has one.
         logger: Where it records; nowhere by default.
 
-    Attributes:
-        stopped: Whether the callback has asked to end the training. ``fit`` goes on; ``for _ in learner.fitter(...)``
-            lets the caller break.
+    A callback that asks to end the training ends ``fit`` after that epoch.
     """
 
     def __init__(self, callback: BaseCallback, env: VecEnv | None = None, logger: Logger | None = None) -> None:
-        self.stopped = False
         self._callback = callback
         self._env: VecEnv | None = getattr(callback, "eval_env", None) if env is None else env
         self._logger = logger or Logger(None, [])
         self._model: MPCModel | None = None
 
-    def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:
-        """Steps the callback; at the end of the fit also ends it."""
+    def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> bool:
+        """Steps the callback, at the end of the fit also ends it; False asks to end the fit."""
         try:
             policy = learner.policy
         except MPCOfflineError:  # (VALUE) goes before
-            return
+            return True
         if self._model is None:
             self._model = self._started(learner, policy)
         self._model.set_policy(policy)
         self._model.num_timesteps = total_step
-        if not self._callback.on_step() and not self.stopped:
-            self.stopped = True
-            _log.warning("%s asks to stop after epoch %d; fit goes on.", type(self._callback).__name__, epoch)
-        if learner.result is not None:
+        go_on = self._callback.on_step()
+        if not go_on:
+            _log.info("%s ends the fit after epoch %d", type(self._callback).__name__, epoch)
+        if learner.result is not None or not go_on:
             self._callback.on_training_end()
+        return go_on
 
     def _started(self, learner: OfflineMPCLearner, policy: MPCPolicy) -> MPCModel:
         model = MPCModel(policy, self._env)

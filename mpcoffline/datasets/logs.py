@@ -92,6 +92,8 @@ def _run(env: gym.Env[Any, Any], policy: Any, number: int, seed: int | None, det
     observation, info = env.reset(seed=seed)
     if seed is not None:
         env.action_space.seed(seed)  # for policies that sample it
+        if hasattr(policy, "set_random_seed"):  # for those that explore
+            policy.set_random_seed(seed)
     episode = EpisodeBuilder(observation, info)
     state: Any = None
     first, done = np.ones(1, dtype=bool), False

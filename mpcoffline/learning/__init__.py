@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from .regression import FitConfig, FitResult, ParameterTraining, fit_parameters
+from .terminal import DistillConfig, TerminalError, fit_terminal, terminal_error
 from .value import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
+from .value_noise import Stochasticity, estimate_stochasticity
 
 __all__ = [
     "VALUE_METHODS",
+    "DistillConfig",
     "FitConfig",
     "FitResult",
     "ParameterTraining",
+    "Stochasticity",
+    "TerminalError",
     "ValueConfig",
     "ValueFunction",
     "ValueTraining",
+    "estimate_stochasticity",
     "fit_parameters",
+    "fit_terminal",
     "fit_value",
+    "terminal_error",
 ]

@@ -195,7 +195,7 @@ def _linear_rows(arena: _Arena, table: TransitionTable, values: dict[str, ValueF
 
 
 #: MPC_2 with a cross term: V* is needed here, not the value of the behaviour, and only where the task lives.
-CROSSED: dict[str, Any] = {"cross_term": True, "tau": 0.05, "trim": 0.7}
+CROSSED: dict[str, Any] = {"cross_term": True, "tau": 0.05, "trim": 0.5}
 
 
 def without(nominal: MPC, name: str, value: float) -> MPC:
