@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_STARTS = 20
+_FEW_STARTS = 3
 _SCARCE_GOAL = 1e-3
 _BLIND_VALUE = 0.3
 _WORSE_MODEL = 2.0
@@ -49,7 +51,7 @@ def diagnose(
     learner: OfflineMPCLearner,
     dataset: MinariDataset | TransitionTable | str,
     *,
-    n_starts: int = 20,
+    n_starts: int | None = None,
     n_steps: int = 100,
     seed: int = 0,
 ) -> Report:
@@ -68,7 +70,8 @@ def diagnose(
     Args:
         learner: A fitted learner.
         dataset: What it was fitted on, or another log of the same plant.
-        n_starts: Episodes simulated on each model.
+        n_starts: Episodes simulated on each model; 20 by default, 3 where a controller needs ipopt (with constraints),
+            which takes minutes even so.
         n_steps: Their length.
         seed: Seeds the ensemble and the choice of starts.
 
@@ -79,7 +82,7 @@ def diagnose(
         MPCOfflineError: If the learner was not fitted.
         InvalidDataError: If the data have other dimensions than the MPC.
     """
-    check_integers(1, n_starts=n_starts, n_steps=n_steps)
+    check_integers(1, n_steps=n_steps, **({} if n_starts is None else {"n_starts": n_starts}))
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
@@ -88,8 +91,9 @@ def diagnose(
     clean, identified = found.table, nominal.with_theta(found.identification.theta)
     ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
     cost = LoggedCost(clean, seed)
-    starts = initial_states(clean, n_starts, seed)
     policies = MPCPolicy(nominal), MPCPolicy(learned)
+    slow = any(policy.solver.name == "ipopt" for policy in policies)
+    starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
     first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
     comparison = Comparison.of(first, second, cost.r2)
     lag = lag_check(identified, table)

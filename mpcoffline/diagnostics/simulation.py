@@ -62,7 +62,8 @@ def simulate(
     """
     columns = table.columns(table.rows.astype(np.float64))
     middle, spread = columns.observations.mean(axis=0), columns.observations.std(axis=0)
-    reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread + 1e-9
+    reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread
+    reach = np.where(spread > 0.0, reach, np.inf)
     dearest = float(columns.costs.max())
     n, (s, nx) = len(ensemble), starts.shape
     x = np.broadcast_to(starts, (n, s, nx)).copy()

@@ -120,6 +120,24 @@ def test_what_cannot_be_diagnosed_is_refused() -> None:
         diagnose(learner, pendulum)
 
 
+def test_odd_data_give_a_verdict_and_no_nan() -> None:
+    s, a, after = (v.astype(np.float64) for v in (LOG.observations, LOG.actions, LOG.next_observations))
+    n = len(LOG)
+    ones, ids = np.ones((n, 1)), LOG.episode_ids
+    for table in (
+        TransitionTable.from_arrays(
+            np.hstack([s[:, :1], ones]), a, LOG.costs, np.hstack([after[:, :1], ones]), np.zeros(n), ids
+        ),
+        TransitionTable.from_arrays(s, a, 1e6 * LOG.costs, after, np.ones(n), np.arange(n)),
+        TransitionTable.from_arrays(s, a, np.full(n, 7.0), after, np.zeros(n), ids),
+        TransitionTable.from_arrays(*(np.repeat(v[:9], 9, axis=0) for v in (s, a, LOG.costs, after, np.zeros(n)))),
+    ):
+        report = diagnose(fitted(WRONG, table), table, n_starts=2, n_steps=5)
+        assert np.isfinite(report.comparison.ratios).all()
+        assert report.reasons
+        json.loads(report.to_json())
+
+
 @pytest.mark.slow
 def test_a_swing_up_is_diagnosed() -> None:
     from mpcoffline.learning import ValueConfig, fit_value
