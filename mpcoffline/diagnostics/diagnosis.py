@@ -96,7 +96,7 @@ def diagnose(
     starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
     first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
     comparison = Comparison.of(first, second, cost.r2)
-    lag = lag_check(identified, table)
+    lag = lag_check(identified, clean)
     verdict, reasons = decide(comparison, lag, found.noise, len(table))
     reference = reference_of(learned)
     report = Report(

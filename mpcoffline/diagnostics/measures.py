@@ -27,6 +27,7 @@ _REGIONS = 4
 _NEAR = 0.25  # spreads of the data: a state this close to the reference has reached it
 _LAGS = 2
 _LAG_FEATURES = 100
+_MUCH_LAG = 0.05  # of the effect of the present input
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class LagCheck:
     @property
     def found(self) -> bool:
         """Whether inputs act late, by a share that matters."""
-        return self.share > 0.1 and self.p_value < 1e-6
+        return self.share > _MUCH_LAG and self.p_value < 1e-6
 
 
 def returns_of(value: ValueFunction, table: TransitionTable, discount: float) -> tuple[Array, Array]:
@@ -202,7 +203,8 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
 
     Args:
         identified: The MPC with the identified model.
-        table: The transitions as logged: smoothing would hide a lag.
+        table: The transitions, smoothed where they were noisy: past inputs tell of the true state, and with it of the
+            noise in the logged one.
     """
     rows = np.arange(_LAGS, len(table))
     same = (table.episode_ids[rows] == table.episode_ids[rows - _LAGS]) & (table.terminations[rows - 1] == 0.0)
