@@ -25,6 +25,7 @@ _log = logging.getLogger(__name__)
 
 _OTHER_MAGNITUDE = 30.0
 _SCALE_ROWS = 5_000
+_TERMINAL_ROWS = 100_000
 
 
 class Epoch(NamedTuple):
@@ -151,7 +152,7 @@ class Fit:
         terminal_cost = fit_terminal(
             kind,
             value if potential is None else lambda s: value(s) - potential(s).float(),
-            table.observations,
+            table.observations[:: max(1, len(table) // _TERMINAL_ROWS)],  # a view; the table may be larger than memory
             x_ref=_reference(mpc),
             blend=config.terminal_blend,
             seed=self._seed,

@@ -229,6 +229,21 @@ def test_the_tails_are_left_out() -> None:
     np.testing.assert_array_equal(fitted(table).theta, fitted(near, trim=1.0).theta)
 
 
+@pytest.mark.parametrize("preset", ["paper", "default"])
+def test_tables_larger_than_memory_are_learned_from(preset: str, tmp_path: Path) -> None:
+    dataset = stored(linear_episodes())
+    mapped = TransitionTable.from_minari(dataset, memory=2_000, cache=tmp_path / "tables")
+    assert mapped.is_mapped
+    mpc = nominal_mpc("mpcoffline/LinearTracking-v0").replace(horizon=5)
+    learner = quick(mpc, preset=preset, terminal="quadratic", fit_n_steps=5, trim=1.0)
+    learner.fit(mapped, show_progress=False)
+    assert np.isfinite(learner.theta).all()
+    in_memory = quick(mpc, preset=preset, terminal="quadratic", fit_n_steps=5, trim=1.0)
+    in_memory.fit(dataset, show_progress=False)
+    # Rows are shuffled block by block: other minibatches, the same problem.
+    np.testing.assert_allclose(learner.mpc.values["model.A"], in_memory.mpc.values["model.A"], atol=0.2)
+
+
 def test_learning_solves_no_mpc(monkeypatch: pytest.MonkeyPatch) -> None:
     def forbidden(*_: Any, **__: Any) -> Any:
         raise AssertionError("an optimal control problem was set up while learning")

@@ -1,0 +1,109 @@
+"""(FIT) step by step: stopping and going on, restarts, the prediction error besides, and what is said of bounds."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import casadi as ca
+import lq_plant
+import numpy as np
+import pytest
+import torch
+from lq_plant import BEST, QuadraticValue
+
+from mpcoffline.learning import FitConfig, ParameterTraining
+from mpcoffline.learning.bellman import BellmanFit, PredictionError
+from mpcoffline.mpc import MPC, Model, Parameter
+
+BOTH = ("cost", "model")
+WRONG = (0.5 * lq_plant.A, 2.0 * lq_plant.B)
+
+
+def training(mpc: MPC | None = None, groups: tuple[str, ...] = BOTH, **options: Any) -> ParameterTraining:
+    config = FitConfig(**({"n_steps": 60, "batch_size": 64, "refit_iterations": 50} | options))
+    value = QuadraticValue(BEST.P)
+    return ParameterTraining(mpc or lq_plant.make_mpc(), value, lq_plant.random_log(400), groups, config, seed=0)
+
+
+@pytest.mark.parametrize("stops", [(1,), (20, 45), (60,)])
+def test_going_on_gives_the_same_bits(stops: tuple[int, ...]) -> None:
+    whole = training()
+    whole.advance(60)
+    part = training()
+    for stop in stops:
+        part.advance(stop - part.step)
+        arrays = part.to_arrays()
+        part = training()
+        part.restore(arrays)
+        assert part.step == stop
+    part.advance(60 - part.step)
+    assert part.done
+    np.testing.assert_array_equal(part.theta, whole.theta)
+    np.testing.assert_array_equal(part.finish().theta, whole.finish().theta)
+
+
+def test_the_prediction_error_is_its_formula() -> None:
+    mpc, table = lq_plant.make_mpc(), lq_plant.random_log(200)
+    problem = BellmanFit(mpc, QuadraticValue(BEST.P), 1.0)
+    sample = table.columns(torch.from_numpy(table.rows))
+    s, a, reached = (
+        np.asarray(c, dtype=np.float64) for c in (table.observations, table.actions, table.next_observations)
+    )
+    missed = reached - (s @ lq_plant.MODEL_A.T + a @ lq_plant.MODEL_B.T)
+    expected = np.mean((missed / (reached - s).std(axis=0)) ** 2)
+    found = PredictionError(problem, sample)(sample, torch.from_numpy(mpc.theta))
+    assert float(found) == pytest.approx(expected, rel=1e-6)
+
+
+def test_with_a_large_weight_the_model_is_identified() -> None:
+    """(FIT) alone does not need the true model; the prediction error besides finds it."""
+    mpc = lq_plant.make_mpc(WRONG)
+    errors = []
+    for weight in (0.0, 100.0):
+        fit = training(mpc, n_steps=400, batch_size=400, prior=0.0, prediction_weight=weight, clip=1e6)
+        while not fit.done:
+            fit.advance(100)
+        values = mpc.with_theta(fit.theta).values
+        errors.append(max(np.abs(values["model.A"] - lq_plant.A).max(), np.abs(values["model.B"] - lq_plant.B).max()))
+    assert errors[1] < 0.02 < errors[0]
+
+
+def test_a_fit_that_runs_off_begins_again_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    fit = training(learning_rate=50.0, n_steps=5, n_restarts=2, prior=0.0)
+    with caplog.at_level(logging.WARNING):
+        while not fit.done:
+            fit.advance(5)
+    assert fit.attempt == 2
+    assert "starting again beside theta_0 (1 of at most 2 restarts)" in caplog.text
+    result = fit.finish()
+    assert "failed in every attempt; the model stays as it was" in caplog.text
+    mpc = lq_plant.make_mpc()
+    np.testing.assert_array_equal(mpc.with_theta(result.theta).values["model.A"], lq_plant.MODEL_A)
+    assert result.loss_after < result.loss_before  # the cost is fitted all the same
+
+
+def test_parameters_that_end_on_a_bound_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    model = Model(
+        lambda x, u, p: lq_plant.A @ x + p["gain"] * ca.DM(lq_plant.B) @ u,
+        2,
+        1,
+        0.1,
+        {"gain": Parameter(0.5, low=0.1, high=0.6)},  # the plant's is 1
+        discrete=True,
+    )
+    fit = training(lq_plant.make_mpc().replace(model=model), n_steps=200, prior=0.0)
+    while not fit.done:
+        fit.advance(100)
+    result = fit.finish()
+    assert result.at_bounds == ("model.gain",)
+    assert "ended on the bounds of model.gain" in caplog.text
+
+
+def test_no_gradient_steps_leave_the_model_to_identification() -> None:
+    mpc = lq_plant.make_mpc()
+    fit = training(mpc, n_steps=0)
+    assert fit.done
+    result = fit.finish()
+    np.testing.assert_array_equal(mpc.with_theta(result.theta).values["model.A"], lq_plant.MODEL_A)
+    assert result.loss_after < result.loss_before
