@@ -161,10 +161,9 @@ def _notes(report: Report) -> tuple[str, ...]:
     if report.value.n and report.value.correlation < _BLIND_VALUE:
         notes.append("V hardly follows the measured returns: learn it longer, or by another method.")
     if report.prediction.learned > _WORSE_MODEL * report.prediction.identified + 0.01:
-        factor = report.prediction.learned / max(report.prediction.identified, 1e-12)
         notes.append(
-            f"The learned model predicts {factor:.1f} times worse than the identified one: Theorem 1 allows that, but"
-            " init='identified' is the safer start."
+            f"The learned model misses {report.prediction.learned:.1%} of an increment, the identified one"
+            f" {report.prediction.identified:.1%}: Theorem 1 allows that, but init='identified' is the safer start."
         )
     if report.prediction.undetermined:
         notes.append(

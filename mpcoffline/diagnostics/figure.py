@@ -95,11 +95,11 @@ def _draw_distances(axes: Axes, report: Report) -> None:
             linewidth=style.width,
             label=controller_label(name),
         )
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])
     axes.set_xlabel("step (median and quartiles over the starts)")
     axes.set_ylabel("distance to the goal [spreads]" if traces.goal is not None else "distance to the end [spreads]")
     axes.set_title("Closed loops on the identified model", loc="left")
-    axes.legend(loc="upper right")
+    axes.legend(loc="upper right", ncols=2, fontsize=7)
 
 
 def _draw_value(axes: Axes, report: Report) -> None:

@@ -99,34 +99,31 @@ def decide(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_rows: 
     Returns:
         The verdict, and its reasons with what to do, the decisive one first.
     """
-    c = comparison
+    c, withheld = comparison, _withheld(comparison, lag, noise, n_rows)
     worst, first = max(c.ratios), c.ratios[0]
-    less_success = [b < a for a, b in zip(c.nominal_success, c.learned_success, strict=True)]
-    better = worst < c.limit and not any(less_success)
-    withheld = _withheld(comparison, lag, noise, n_rows)
-    if better and not withheld:
+    fewer = [learned < nominal for nominal, learned in zip(c.nominal_success, c.learned_success, strict=True)]
+    if worst < c.limit and not any(fewer) and not withheld:
         least, most = 100.0 * (1.0 - worst), 100.0 * (1.0 - min(c.ratios))
         text = (
             f"Better on models of your data: {least:.0f} % to {most:.0f} % less cost than MPC_1 on all"
             f" {len(c.ratios)} of them. The plant may still differ: begin with supervised trials."
         )
         return "recommend", (text,)
-    promising = first < _CARE and c.learned_success[0] >= c.nominal_success[0]
-    reasons = list(withheld) if better or promising else []
-    if any(less_success):
-        reasons.append(
-            f"On {sum(less_success)} of {len(less_success)} models fewer episodes end at low cost than with MPC_1:"
-            " look at these closed loops before any trial."
+    doubts = list(withheld)
+    if any(fewer):
+        doubts.append(
+            f"On {sum(fewer)} of {len(fewer)} models fewer episodes end at low cost than with MPC_1: look at these"
+            " closed loops before any trial."
         )
-    if not better and worst >= c.limit:
-        reasons.append(
-            f"In the worst case it costs {worst:.2f} times as much as MPC_1, where less than {c.limit:.2f} is asked for"
-            f" ({first:.2f} on the identified model): record more data where the models disagree."
+    if first >= _CARE:
+        doubts.insert(0, f"{first:.2f} times the cost of MPC_1 on the identified model is no clear gain: keep MPC_1.")
+        return "keep MPC_1", tuple(doubts)
+    if worst >= c.limit:
+        doubts.append(
+            f"{first:.2f} times the cost of MPC_1 on the identified model, but {worst:.2f} times on the worst of"
+            f" {len(c.ratios)}, where less than {c.limit:.2f} is asked for: record more data where the models disagree."
         )
-    if promising:
-        return "try with care", tuple(reasons)
-    reasons.insert(0, f"No clear gain on the identified model ({first:.2f} times the cost of MPC_1): keep MPC_1.")
-    return "keep MPC_1", tuple(reasons)
+    return ("keep MPC_1" if fewer[0] else "try with care"), tuple(doubts)
 
 
 def _withheld(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_rows: int) -> tuple[str, ...]:

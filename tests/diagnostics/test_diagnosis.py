@@ -77,7 +77,7 @@ def test_where_nothing_can_be_gained_mpc_1_is_kept() -> None:
     report = diagnose(fitted(lq_plant.make_mpc((lq_plant.A, lq_plant.B))), LOG, n_starts=8, n_steps=40)
     assert report.verdict == "keep MPC_1"
     assert report.comparison.ratios[0] == pytest.approx(1.0, abs=0.02)
-    assert "No clear gain" in report.reasons[0]
+    assert "no clear gain" in report.reasons[0]
 
 
 def test_late_inputs_withhold_the_recommendation() -> None:
