@@ -25,7 +25,7 @@ def mpc_of(case: str) -> MPC:
     if case == "three inputs":
         return random_linear(0, nu=3)
     if case == "network":
-        network = NetworkCost.random(3, (12, 12), seed=0, scale=10.0, W=np.eye(3), x_ref=[1.0, 0.0, 0.0])
+        network = NetworkCost.random(3, (6, 6), seed=0, scale=10.0, W=np.eye(3), x_ref=[1.0, 0.0, 0.0])
         return nominal_mpc(PENDULUM).replace(horizon=10, discount=0.95, terminal_cost=network)
     mpc = nominal_mpc(case)
     return mpc.replace(horizon=min(mpc.horizon, 50))
@@ -98,7 +98,7 @@ def test_the_header_documents_names_and_units(tmp_path: Path) -> None:
     assert "u[0]: from -2 to 2" in header
     export_c(MPCPolicy(mpc_of("network")), tmp_path / "network")
     header = (tmp_path / "network" / "mpc_controller.h").read_text()
-    assert re.search(r"double terminal_cost_weights_1\[144\]; /\* .*shape \(12, 12\), row by row \*/", header)
+    assert re.search(r"double terminal_cost_weights_1\[36\]; /\* .*shape \(6, 6\), row by row \*/", header)
     source = (tmp_path / "mpc_controller.c").read_text()
     assert "malloc" not in source
     assert set(re.findall(r"#include\s+(\S+)", source)) == {'"mpc_controller.h"', "<math.h>", "<stdint.h>"}

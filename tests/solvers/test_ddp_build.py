@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mpc_problems import random_linear
 
-from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.mpc import MPC, Model, NetworkCost, QuadraticCost
 from mpcoffline.solvers import CompilerError, DDPSolver, make_solver
 from mpcoffline.solvers.ddp import build
 from mpcoffline.solvers.ddp.codegen import source
@@ -212,7 +212,8 @@ int main(void) {
         for (int k = 0; k < n * NU; ++k) u0[k] = 0.3 * uniform();
         for (int i = 0; i < n; ++i)
             for (int k = 0; k < NP; ++k) theta[i * NP + k] = given[k];
-        mpc_batch batch = {n, x0, theta, round % 2 ? u0 : NULL, x, u, J, predicted, iterations, status, 0};
+        int64_t stride = round % 3 ? NP : 0;
+        mpc_batch batch = {n, x0, theta, round % 2 ? u0 : NULL, stride, x, u, J, predicted, iterations, status, 0};
         for (int64_t part = 0; part < 2; ++part)
             if (mpc_solve_cold(&problem, &batch, candidates, M, 8, part, 2)) return 1;
         for (int k = 0; k < n * NX; ++k) x0[k] += 0.1 * uniform();
@@ -229,13 +230,15 @@ int main(void) {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["pendulum", "three inputs"])
+@pytest.mark.parametrize("case", ["pendulum", "three inputs", "network"])
 def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
     """Address and undefined-behaviour sanitizers on cold and warm batches, imposed inputs, overflowing states."""
     compiler = shutil.which("gcc")
     if compiler is None:
         pytest.skip("no gcc")
     mpc = nominal_mpc("mpcoffline/PendulumSwingUp-v0") if case == "pendulum" else random_linear(0, nu=3)
+    if case == "network":
+        mpc = mpc.replace(terminal_cost=NetworkCost.random(4, (5, 5), seed=0), horizon=15)
     code, program = tmp_path / "driver.c", tmp_path / "driver"
     theta = ", ".join(repr(float(v)) for v in mpc.theta)
     code.write_text(source(mpc) + DRIVER.replace("THETA", theta))

@@ -13,7 +13,7 @@ from scipy.linalg import solve_discrete_are
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, QuadraticCost
-from mpcoffline.solvers import DDPSolver, IpoptSolver, Solution
+from mpcoffline.solvers import DDPSolver, IpoptSolver, Plan, Solution
 from mpcoffline.tasks import nominal_mpc
 
 LINEAR, PENDULUM, CARTPOLE = ENV_IDS
@@ -231,3 +231,17 @@ def test_bad_options_are_refused(options: dict[str, int], name: str) -> None:
 def test_constraints_are_refused() -> None:
     with pytest.raises(InvalidArgumentError, match="constraints"):
         DDPSolver(nominal_mpc(PENDULUM).replace(constraints=lambda x, u, p: x[2] - 5.0))
+
+
+@pytest.mark.parametrize("limit", [6, 10, 16])
+def test_what_the_iteration_limit_accepts_is_solved(limit: int) -> None:
+    """Going on from there changes value and input by next to nothing."""
+    mpc = nominal_mpc(CARTPOLE)
+    x = random_states(CARTPOLE, 200, limit)
+    early, solver = DDPSolver(mpc, max_iterations=limit).solve(x), DDPSolver(mpc)
+    good = early.success
+    assert 0.1 < good.mean() < 0.99
+    longer = solver.solve(x[good], warm_start=Plan(early.x[good], early.u[good]))
+    assert longer.success.all()
+    assert (np.abs(early.value[good] - longer.value) < 1e-6 * (1.0 + np.abs(longer.value))).all()
+    np.testing.assert_allclose(early.u0[good], longer.u0, rtol=0, atol=1e-3)

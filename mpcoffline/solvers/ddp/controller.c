@@ -3,9 +3,10 @@
 /* Iterates from w->x, w->u; J = INFINITY says that w->x need not obey the model. Returns one of the states above. */
 static int solve(const mpc_problem *m, lanes *w) {
     w->mu = 0.0;
-    for (int64_t k = 0; k < m->max_iterations; ++k) {
+    for (int64_t k = 1; k <= m->max_iterations; ++k) {
         vl converged, moved, stalled;
         iterate(m, w, -1, &converged, &moved, &stalled);
+        if (k == m->max_iterations && !stalled) converged |= acceptable(m, w);
         if (!converged && !stalled) continue;
         double zero = w->J - w->J; /* NaN as soon as something is not finite */
         for (int i = 0; i < MPC_HORIZON * NU; ++i) zero += w->u[i] - w->u[i];

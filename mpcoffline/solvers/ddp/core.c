@@ -30,6 +30,7 @@ enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING 
 #define MU_MAX 1e6
 #define ARMIJO 1e-4
 #define INPUT_TOLERANCE 3e-5
+#define ACCEPTABLE 1e3 /* times the tolerance is good enough once the iterations are used up */
 #define RIDGE 1e-12   /* keeps a singular Quu (an input that nothing depends on) invertible */
 #define RACE_ITERATIONS 4                 /* of each start of a cold solve, before the best go on */
 #define FINALISTS(starts) (((starts) + 3) / 4)
@@ -50,6 +51,7 @@ typedef struct {
     vd *k, *K;                 /* feedforward (N, NU), feedback (N, NU, NX) column-major */
     vd p[NP + NQ + 1], s[NX], low0[NU], high0[NU];
     vd J, J_new, mu, predicted, defect;
+    vl settled; /* lanes whose first input has settled */
     vl pd; /* lanes whose backward pass found a positive definite Quu */
 } lanes;
 
@@ -338,6 +340,11 @@ static void accept(const mpc_problem *m, lanes *w, vl mask) {
     for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(mask, w->x_new[k], w->x[k]);
 }
 
+/* Lanes that Gauss-Newton, where it creeps, has brought near enough to a solution. */
+static vl acceptable(const mpc_problem *m, const lanes *w) {
+    return w->settled & vd_lt(w->predicted, ACCEPTABLE * m->tolerance * (1.0 + vd_abs(w->J)));
+}
+
 /* One iteration: backward pass, line search, regularisation. Lanes that are not wanted may be left where they are.
  * Returns which lanes have converged, moved, and stalled. */
 static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl *moved, vl *stalled) {
@@ -347,6 +354,7 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
     for (int a = 0; a < NU; ++a) settled &= vd_le(vd_abs(w->k[a]), INPUT_TOLERANCE * (1.0 + vd_abs(w->u[a])));
     /* A step found with heavy regularisation promises little without being near a solution. */
     settled &= w->pd & vd_le(w->mu, V(1.0));
+    w->settled = settled;
     /* A point is a solution when the model holds and the quadratic model promises no further decrease. */
     vl small = settled & vd_lt(vd_abs(w->J), V(INFINITY)) & vd_lt(w->predicted, m->tolerance * (1.0 + vd_abs(w->J)));
     vl open = all_lanes();

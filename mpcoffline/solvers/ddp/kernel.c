@@ -63,18 +63,18 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
 static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w, int lane, int64_t i, int64_t status,
                        int64_t iterations) {
     int64_t N = m->horizon;
-    double zero = w->J[lane] - w->J[lane]; /* NaN as soon as something is not finite */
+    int finite = isfinite(w->J[lane]) != 0;
     for (int64_t k = 0; k < N * NU; ++k) {
         b->u[i * N * NU + k] = w->u[k][lane];
-        zero += w->u[k][lane] - w->u[k][lane];
+        finite &= isfinite(w->u[k][lane]) != 0;
     }
     for (int64_t k = 0; k < (N + 1) * NX; ++k) {
         b->x[i * (N + 1) * NX + k] = w->x[k][lane];
-        zero += w->x[k][lane] - w->x[k][lane];
+        finite &= isfinite(w->x[k][lane]) != 0;
     }
     b->J[i] = w->J[lane];
     b->predicted[i] = w->predicted[lane];
-    b->status[i] = zero == 0.0 ? status : NOT_FINITE;
+    b->status[i] = finite ? status : NOT_FINITE;
     b->iterations[i] = iterations;
 }
 
@@ -116,7 +116,8 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             if (problem[l] < 0) continue;
             int64_t status = converged[l] ? CONVERGED : stalled[l] ? STALLED : RUNNING;
             ++count[l];
-            if (status == RUNNING && count[l] >= m->max_iterations) status = ITERATION_LIMIT;
+            if (status == RUNNING && count[l] >= m->max_iterations)
+                status = acceptable(m, w)[l] ? CONVERGED : ITERATION_LIMIT;
             if (status != RUNNING) {
                 store_lane(m, b, w, l, problem[l], status, count[l]);
                 problem[l] = -1;
