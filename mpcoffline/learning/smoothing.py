@@ -33,6 +33,8 @@ _FEW_ROWS = 20_000  # on which the model is identified
 _FEWEST_PAIRS = 30  # of consecutive rows, for an estimate of the noise
 _SIGNIFICANT = 3.0  # standard errors above zero
 _LEAST_PROCESS = 1e-4  # of the increments' spread: keeps covariances regular
+_BLOCK = 1_000  # consecutive rows that are taken together
+_CHUNK = 100_000  # rows that are smoothed at a time
 _FEWER_ROWS = 4_000  # on which the process noise is chosen
 _PROCESS_FACTORS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 _FAR = 10.0  # standard deviations of a measurement: no smoothing goes that far
@@ -131,7 +133,7 @@ def estimate_noise(mpc: MPC, table: TransitionTable, theta: Array | None = None)
     """
     found = identify(mpc, table) if theta is None else None
     parameters, unwrapped = (found.theta, found.unwrapped) if found else (np.asarray(theta, np.float64), ())
-    return _noise(Trajectories.of(mpc, table, unwrapped), parameters)
+    return _noise(Trajectories.of(mpc, _excerpt(table, 0), unwrapped), parameters)
 
 
 def smooth(
@@ -150,15 +152,18 @@ def smooth(
         unwrapped: Coordinates that are wrapped angles.
 
     Returns:
-        A new table of the same rows; actions, costs and terminations as they were.
+        A new table of the same rows, in memory; actions, costs and terminations as they were.
 
     Raises:
         InvalidArgumentError: For a noise estimate of another size.
     """
     if noise.measurement.shape != (mpc.nx,):
         raise InvalidArgumentError("noise", expected=f"{mpc.nx} coordinates", actual=str(noise.measurement.shape))
-    problem = Trajectories.of(mpc, table, unwrapped)
-    return _smoothed_table(problem, table, theta, noise)
+    states = np.empty((2, len(table), mpc.nx), dtype=np.float32)
+    for start in range(0, len(table), _CHUNK):
+        part = _rows_of(table, slice(start, start + _CHUNK))
+        states[:, start : start + _CHUNK] = _smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)
+    return _with_states(table, *states)
 
 
 def identify_smoothed(
@@ -184,8 +189,7 @@ def identify_smoothed(
     """
     config = config or IdentificationConfig()
     first = identify(mpc, table, config, seed=seed)
-    problem = Trajectories.of(mpc, table, first.unwrapped)
-    few = problem.thinned(_FEW_ROWS, seed)
+    few = Trajectories.of(mpc, _excerpt(table, seed), first.unwrapped).thinned(_FEW_ROWS, seed)
     noise = _noise(few, first.theta)
     if noise.source == "unknown" or noise.negligible:
         return SmoothedIdentification(first, table, noise)
@@ -200,13 +204,15 @@ def identify_smoothed(
         z, about = np.clip(z + step, coordinates.low, coordinates.high), smoothed(found)
         if np.abs(step).max(initial=0.0) < _SETTLED:
             break
-    theta = coordinates.theta(z)
-    result = _smoothed_table(problem, table, theta, noise)
+    if not _likelihood(few, coordinates.theta(z), noise) <= _likelihood(few, first.theta, noise):
+        z = coordinates.z(first.theta)
     logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
-    chosen = OneStepProblem(mpc, Trajectories.of(mpc, result, first.unwrapped).thinned(_FEW_ROWS, seed).rows())
-    return SmoothedIdentification(
-        described(mpc, chosen, z, information, config.prior_spread, first.unwrapped), result, noise
+    result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
+    clean = Trajectories.of(mpc, _excerpt(result, seed), first.unwrapped)
+    identification = described(
+        mpc, OneStepProblem(mpc, clean.rows()), z, information, config.prior_spread, first.unwrapped
     )
+    return SmoothedIdentification(identification, result, noise)
 
 
 def _noise(problem: Trajectories, theta: Array) -> NoiseEstimate:
@@ -284,10 +290,13 @@ def _gauss_newton(found: Filtered, coordinates: OneStepProblem, z: Array, spread
     return step / max(1.0, float(np.abs(step).max(initial=0.0))), information
 
 
-def _smoothed_table(
-    problem: Trajectories, table: TransitionTable, theta: Array, noise: NoiseEstimate
-) -> TransitionTable:
-    """The table with smoothed states; those far from what was measured stay as they were."""
+def _likelihood(problem: Trajectories, theta: Array, noise: NoiseEstimate) -> float:
+    """Minus twice the log likelihood of the data under a model."""
+    return filtered(problem.linearised(theta, problem.measured), *_filter_noise(problem, noise)).likelihood
+
+
+def _smoothed_states(problem: Trajectories, theta: Array, noise: NoiseEstimate) -> Array:
+    """S and s+ of every row, ``(2, n, nx)``; those that come out far from what was measured stay as they were."""
     x = problem.measured
     for _ in range(_SMOOTHINGS):
         x = smoothed(filtered(problem.linearised(theta, x), *_filter_noise(problem, noise)))
@@ -295,10 +304,24 @@ def _smoothed_table(
     x = np.where((~np.isfinite(x) | far).any(axis=2, keepdims=True), problem.measured, x) * problem.scale
     x = x.swapaxes(0, 1)
     valid, where = problem.valid, problem.index[problem.valid]
-    s, reached = np.empty((len(table), x.shape[2])), np.empty((len(table), x.shape[2]))
-    s[where] = (x[:, :-1] - problem.turns[:, :, 0])[valid]
-    reached[where] = (x[:, 1:] - problem.turns[:, :, 1])[valid]
-    return _with_states(table, s, reached)
+    states = np.empty((2, len(where), x.shape[2]))
+    states[0, where] = (x[:, :-1] - problem.turns[:, :, 0])[valid]
+    states[1, where] = (x[:, 1:] - problem.turns[:, :, 1])[valid]
+    return states
+
+
+def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
+    """The table, or of a large one some stretches of consecutive rows."""
+    n_blocks, wanted = -(-len(table) // _BLOCK), 2 * _FEW_ROWS // _BLOCK
+    if n_blocks <= wanted:
+        return table
+    chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])
+    rows = (chosen[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
+    return _rows_of(table, rows[rows < len(table)])
+
+
+def _rows_of(table: TransitionTable, rows: slice | NDArray[np.intp]) -> TransitionTable:
+    return TransitionTable(table.rows[rows], table.ny, table.nu, table.episode_ids[rows], table.name)
 
 
 def _with_states(table: TransitionTable, s: Array, reached: Array) -> TransitionTable:

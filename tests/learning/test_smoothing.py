@@ -220,3 +220,15 @@ def test_a_long_trajectory_is_smoothed_in_pieces() -> None:
     clean = episodes(PENDULUM.model, n=1, steps=450)
     result = identify_smoothed(GUESS, with_measurement_noise(clean, 0.05, 1))
     assert distance(result.table, clean) < 0.02
+
+
+@pytest.mark.slow
+def test_a_large_table_is_identified_from_stretches_and_smoothed_in_chunks() -> None:
+    clean = episodes(PENDULUM.model, n=1_100, steps=100)
+    noisy = with_measurement_noise(clean, 0.05, 1)
+    result = identify_smoothed(GUESS, noisy)
+    np.testing.assert_allclose(result.identification.theta[:2], TRUE, rtol=0.01)
+    assert distance(result.table, clean) < 0.007
+    spread = clean.observations.std(axis=0)
+    worst = np.abs((result.table.observations - clean.observations) / spread).max()
+    assert worst < 0.3  # also where the chunks meet
