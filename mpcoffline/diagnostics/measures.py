@@ -10,7 +10,7 @@ import scipy.stats
 import torch
 from numpy.typing import NDArray
 
-from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.datasets.transitions import Columns, TransitionTable
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.learning.bellman import BellmanFit
 from mpcoffline.learning.identification import increments_scale
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 _ROWS = 10_000
 _TREE_ROWS = 5_000
+_MOST_EPISODES = 200
 _TAIL = 0.05  # share of a discounted return that may lie beyond the episode's end
 _REGIONS = 4
 _NEAR = 0.25  # spreads of the data: a state this close to the reference has reached it
@@ -84,7 +85,7 @@ class LagCheck:
 
 
 def returns_of(value: ValueFunction, table: TransitionTable, discount: float) -> tuple[Array, Array]:
-    """V and the measured return of states of the last tenth of the episodes, ``(n,)`` each.
+    """V and the measured return of states of the last tenth of the episodes (200 at most), ``(n,)`` each.
 
     Only where nearly all of a discounted return lies within its episode.
 
@@ -94,10 +95,10 @@ def returns_of(value: ValueFunction, table: TransitionTable, discount: float) ->
         discount: gamma.
     """
     needed = int(np.ceil(np.log(_TAIL) / np.log(discount))) if discount < 1.0 else len(table)
-    ids = np.unique(table.episode_ids)
+    ids, firsts, lengths = np.unique(table.episode_ids, return_index=True, return_counts=True)
     observations, returns = [], []
-    for episode in ids[-max(1, len(ids) // 10) :]:
-        rows = np.flatnonzero(table.episode_ids == episode)
+    for k in range(len(ids) - min(max(1, len(ids) // 10), _MOST_EPISODES), len(ids)):
+        rows = np.arange(firsts[k], firsts[k] + lengths[k])
         costs, ended = table.costs[rows].astype(np.float64), table.terminations[rows[-1]] > 0.0
         total = np.zeros(len(rows) + 1)
         for t in range(len(rows) - 1, -1, -1):
@@ -156,11 +157,11 @@ def fit_errors(
     )
 
 
-def _residuals(problem: BellmanFit, mpc: MPC, columns: object) -> Array:
+def _residuals(problem: BellmanFit, mpc: MPC, columns: Columns) -> Array:
     theta = torch.from_numpy(mpc.theta)
     with torch.no_grad():
-        explained = problem.predicted_value(columns, theta) + problem.stage_cost(columns, theta)  # type: ignore[arg-type]
-        return np.asarray((problem.target(columns) - explained).numpy())  # type: ignore[arg-type]
+        explained = problem.predicted_value(columns, theta) + problem.stage_cost(columns, theta)
+        return np.asarray((problem.target(columns) - explained).numpy())
 
 
 def outside_support(table: TransitionTable, states: Array) -> float:
