@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import logging
@@ -10,9 +11,11 @@ from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.learning import FitResult, ParameterTraining, ValueFunction, ValueTraining
 from mpcoffline.learning.smoothing import identify_smoothed
 from mpcoffline.learning.terminal import fit_terminal
@@ -82,6 +85,7 @@ class Fit:
         table.check_fits(nominal.nx, nominal.nu, np.asarray(nominal.action_low), np.asarray(nominal.action_high))
         self._groups, self._config, self._table = groups, config, table
         self._seed, self._device = seed, device
+        _check_device(device)
         self._nominal, self._mpc = nominal, restructured(nominal, config)
         self.learned: MPC | None = None
         self.value_function = value_function
@@ -101,7 +105,7 @@ class Fit:
             InvalidDataError: If the data do not fit.
             MPCOfflineError: If a regression fails.
         """
-        table = self._identified(self._table).trim(self._config.trim)
+        table = self._identified(self._table.trim(self._config.trim))
         self._mpc = in_units_of(self._mpc, table)
         if self.value_function is None:
             yield from self._learn_value(table, value_epoch)
@@ -126,9 +130,9 @@ class Fit:
         self.value_function = training.result.cpu()
 
     def _learn_parameters(self, table: TransitionTable, epoch: int) -> Iterator[Epoch]:
-        value = self.value_function
-        if value is None:  # (VALUE) has ended, or V was given
+        if self.value_function is None:  # (VALUE) has ended, or V was given
             return
+        value = copy.deepcopy(self.value_function).cpu().eval().requires_grad_(False)
         training = ParameterTraining(self._mpc, value, table, self._groups, self._config.fit, seed=self._seed)
         self._begin("fit", training)
         phase, n_steps = f"(FIT) learning {'+'.join(self._groups)}", training.n_steps + 1
@@ -151,8 +155,8 @@ class Fit:
         potential = result.potential
         terminal_cost = fit_terminal(
             kind,
-            value if potential is None else lambda s: value(s) - potential(s).float(),
-            table.observations[:: max(1, len(table) // _TERMINAL_ROWS)],  # a view; the table may be larger than memory
+            value if potential is None else lambda s: value(s) - potential(s),
+            table.observations[_some_rows(len(table), _TERMINAL_ROWS)],
             x_ref=_reference(mpc),
             blend=config.terminal_blend,
             seed=self._seed,
@@ -175,7 +179,8 @@ class Fit:
             "seed": self._seed,
         }
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        digest.update(np.ascontiguousarray(self._table.rows).data)
+        for column in (self._table.rows, self._table.episode_ids):
+            digest.update(np.ascontiguousarray(column).data)
         if self.value_function is not None:
             for array in self.value_function.to_arrays().values():
                 digest.update(np.ascontiguousarray(array).data)
@@ -209,7 +214,7 @@ def restructured(nominal: MPC, config: LearnerConfig) -> MPC:
         crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
         return mpc.replace(stage_cost=crossed)
     if config.cross_term:
-        _log.info("cross_term has no effect on a stage cost that is not quadratic or has one already")
+        _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")
     return mpc
 
 
@@ -218,18 +223,33 @@ def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
 
     (FIT) measures distances in the size of theta_0, which has to be that of the cost in the data within a factor of 30.
     """
-    rows = table.columns(table.rows[:: max(1, len(table) // _SCALE_ROWS)])
+    rows = table.columns(table.rows[_some_rows(len(table), _SCALE_ROWS)])
     stage = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full()
     logged, nominal = float(rows.costs.std(dtype=np.float64)), float(stage.std())
     factor = logged / nominal if nominal > 0.0 else 1.0
     if not np.isfinite(factor) or 1.0 / _OTHER_MAGNITUDE < factor < _OTHER_MAGNITUDE or factor == 0.0:
         return mpc
-    _log.warning("the logged cost varies %.3g times as much as the MPC's stage cost, which is scaled to it", factor)
+    weights = [block.name for block in mpc.space if block.group == "cost" and block.kind == "psd"]
     theta = mpc.theta
-    for block in mpc.space:
-        if block.group == "cost" and block.kind == "psd":
-            theta[mpc.space.slices[block.name]] *= np.sqrt(factor)  # of W = C C'
+    for name in weights:
+        theta[mpc.space.slices[name]] *= np.sqrt(factor)  # of W = C C'
+    outcome = f"{', '.join(weights)} scaled to it" if weights else "scale that by hand"
+    _log.warning("the logged cost varies %.3g times as much as the MPC's stage cost: %s", factor, outcome)
     return mpc.with_theta(theta)
+
+
+def _some_rows(n: int, most: int) -> NDArray[np.int64]:
+    """Row numbers in order, at most so many, the same at each call; a stride would meet the length of episodes."""
+    return np.sort(np.random.default_rng(0).permutation(n)[:most])
+
+
+def _check_device(device: str) -> None:
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch raises both
+        raise InvalidArgumentError(
+            "device", expected="a torch device of this machine", actual=f"{device!r}: {error}", hint="Use device='cpu'."
+        ) from error
 
 
 def _reference(mpc: MPC) -> NDArray[np.float64]:

@@ -189,9 +189,9 @@ class OfflineMPCLearner:
                     metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
                 history.append((len(history) + 1, metrics))
                 self.history = history
-                stop = any([callback(self, len(history), epoch.total_step) is False for callback in callbacks])
                 if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
                     saved.write(fit, history)
+                stop = any([callback(self, len(history), epoch.total_step) is False for callback in callbacks])
                 progress.show(epoch)
                 yield history[-1]
                 if stop:
@@ -244,6 +244,7 @@ class OfflineMPCLearner:
             "learned": None if self.result is None else self.mpc.to_json(),
             "learn": self.learn,
             "preset": self.preset,
+            "value_given": self._given_value_function is not None,
             "seed": self.seed,
             "device": self.device,
             "config": asdict(self.config),
@@ -274,6 +275,8 @@ class OfflineMPCLearner:
                 learner._observation_space = box_from_json(document["observation_space"])
             if arrays:
                 learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
+                if document["value_given"]:
+                    learner._given_value_function = learner.value_function
                 if learner.value_function.ny != learner.nominal_mpc.nx:
                     raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
         return learner

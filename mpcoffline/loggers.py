@@ -30,6 +30,7 @@ class CSVLogger:
 
     def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:
         """Adds the rows of an epoch."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
         new = not self._path.exists()
         with self._path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
-from mpcoffline.errors import UnknownIdError
+import numpy as np
+
+from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.learning import FitConfig, ValueConfig
 from mpcoffline.learning.checks import check_integers, check_number
 
@@ -52,6 +54,13 @@ class LearnerConfig:
         if self.horizon is not None:
             check_integers(1, horizon=self.horizon)
         check_number("terminal_blend", self.terminal_blend, 0.0, 1.0, open_low=False)
+        if self.fit.potential and self.terminal in ("given", "norm"):
+            raise InvalidArgumentError(
+                "potential",
+                expected="a terminal cost from V, as T = V - Phi",
+                actual=f"terminal={self.terminal!r}",
+                hint="Set terminal='network' or 'quadratic'.",
+            )
         for name, kinds in (("terminal", Terminal), ("init", Init)):
             if getattr(self, name) not in get_args(kinds):
                 raise UnknownIdError.of(name, str(getattr(self, name)), get_args(kinds))
@@ -80,7 +89,7 @@ class LearnerConfig:
             if given not in homes:
                 raise UnknownIdError.of("option of OfflineMPCLearner", given, sorted(homes))
             prefix, name = homes[given]
-            changes[prefix][name] = value
+            changes[prefix][name] = value.item() if isinstance(value, np.generic) else value  # JSON has no numpy
         changed = {prefix: replace(part, **changes[prefix]) for prefix, part in parts.items()}
         return replace(self, **changes[""], **changed)
 

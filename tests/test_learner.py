@@ -219,14 +219,16 @@ def test_a_given_value_function_is_used_as_it_is() -> None:
     assert [set(metrics) for _, metrics in history] == [{"fit_loss"}]
 
 
-def test_the_tails_are_left_out() -> None:
+@pytest.mark.parametrize("preset", ["paper", "default"])
+def test_the_tails_are_left_out(preset: str) -> None:
     """A tenth of the rows lies far out with absurd costs: with the default trim they count for nothing."""
     near = lq_plant.random_log(900, seed=5)
     rows = np.concatenate([near.rows, near.rows[:100]])
     rows[900:, :2] *= 1e3
     rows[900:, 3] = 1e6
-    table = TransitionTable(rows, 2, 1, np.zeros(1_000, dtype=np.int64))
-    np.testing.assert_array_equal(fitted(table).theta, fitted(near, trim=1.0).theta)
+    table = TransitionTable(rows, 2, 1, np.arange(1_000))
+    options: dict[str, Any] = {"preset": preset} | ({} if preset == "paper" else {"terminal": "quadratic"})
+    np.testing.assert_array_equal(fitted(table, **options).theta, fitted(near, trim=1.0, **options).theta)
 
 
 @pytest.mark.parametrize("preset", ["paper", "default"])
@@ -282,12 +284,24 @@ def test_the_preset_is_the_default_one() -> None:
         ({"trim": 1.5}, InvalidArgumentError, "trim"),
         ({"seed": -1}, InvalidArgumentError, "seed: expected an integer >= 0, got -1"),
         ({"seed": 0.5}, InvalidArgumentError, "seed"),
+        ({"preset": "paper", "potential": True}, InvalidArgumentError, "potential: expected a terminal cost from V"),
         ({"value_function": lq_plant.QuadraticValue(np.eye(3))}, InvalidArgumentError, "value_function: .* 2 coord"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         OfflineMPCLearner(make_mpc(), **options)
+
+
+def test_an_unknown_device_is_refused_before_the_work() -> None:
+    with pytest.raises(InvalidArgumentError, match="device: expected a torch device of this machine"):
+        quick(device="cuda:77").fit(lq_plant.random_log(100), show_progress=False)
+
+
+def test_numpy_numbers_can_be_saved(tmp_path: Path) -> None:
+    learner = quick(prior=np.float32(0.5), horizon=np.int64(7))
+    learner.save(tmp_path / "l.zip")
+    assert OfflineMPCLearner.load(tmp_path / "l.zip").config == learner.config
 
 
 def test_before_fit_there_is_nothing_to_hand_out() -> None:

@@ -49,7 +49,7 @@ class BellmanFit:
 
     def predicted_value(self, batch: Columns, theta: Tensor) -> Tensor:
         """The discounted value of the predicted successor, gamma V(f_th(s,a)), ``(B,)``."""
-        value: Tensor = self.discounted(batch) * self._value(self.predicted(batch, theta).float()).double()
+        value: Tensor = self.discounted(batch) * self._value(self.predicted(batch, theta)).double()
         return value
 
     def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:

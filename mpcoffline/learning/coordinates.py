@@ -60,6 +60,13 @@ class Coordinates:
         """
         return np.where(self._stuck, _OFF_SADDLE, 0.0)
 
+    def z(self, theta: Array) -> Array:
+        """The coordinates ``(size,)`` of a full theta: the inverse of :meth:`theta`."""
+        learned = theta[self.mask]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logarithms = np.log(learned / self._theta_0)
+        return np.where(self.logarithmic, logarithms, (learned - self._theta_0) / self.scale)
+
     def theta(self, z: Tensor) -> Tensor:
         """The full theta ``(size,)`` of z, differentiable in z."""
         theta_0, scale = torch.from_numpy(self._theta_0), torch.from_numpy(self.scale)
@@ -74,6 +81,7 @@ class Coordinates:
         learned = theta[self.mask]
         bounds = np.nan_to_num(self._bounds, posinf=np.nan, neginf=np.nan)
         near = np.abs(learned[:, None] - bounds) <= _AT_BOUND * (1.0 + np.abs(bounds))
+        near &= (self._bounds[:, 0] < self._bounds[:, 1])[:, None]  # a fixed parameter is where it has to be
         return [name for name, on in zip(self._names, near.any(axis=1), strict=True) if on]
 
 

@@ -43,7 +43,7 @@ class IdentificationConfig:
     Attributes:
         rows: Transitions used; a random subset where there are more.
         prior_spread: How far theta_0 may be off, as standard deviation in the scaled coordinates of
-            :class:`~mpcoffline.learning.regression.Coordinates` (1: a factor e). It decides only what the data leave
+            :class:`~mpcoffline.learning.coordinates.Coordinates` (1: a factor e). It decides only what the data leave
             open: its weight against the data is that of a Gaussian prior.
         max_iterations: Bound on the iterations of a descent.
         restarts: Further starting points, drawn from the prior, where the first one ends badly.
@@ -144,10 +144,7 @@ class OneStepProblem:
 
     def z(self, theta: Array) -> Array:
         """The inverse of :meth:`theta`."""
-        c, chosen = self.coordinates, theta[self.coordinates.mask]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = np.where(c.logarithmic, np.log(chosen / self._theta_0), (chosen - self._theta_0) / c.scale)
-        return np.asarray(np.clip(z[self.free], self.low, self.high))
+        return np.asarray(np.clip(self.coordinates.z(theta)[self.free], self.low, self.high))
 
     def slopes(self, z: Array) -> Array:
         """The derivative of theta in z, of the free coordinates."""

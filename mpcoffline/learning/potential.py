@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -31,6 +34,18 @@ class Potential:
         self._scale = torch.where(std > 0.0, std, 1.0)
         self._pairs = torch.triu_indices(len(self._mean), len(self._mean))
         self.coefficients = torch.zeros(len(self._mean) + self._pairs.shape[1], dtype=torch.float64)
+
+    def to_json(self) -> dict[str, list[float]]:
+        """A JSON-able description."""
+        return {"mean": self._mean.tolist(), "scale": self._scale.tolist(), "coefficients": self.coefficients.tolist()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Potential:
+        """The inverse of :meth:`to_json`."""
+        potential = cls(torch.zeros(1, len(data["mean"])))
+        potential._mean, potential._scale = (torch.tensor(data[n], dtype=torch.float64) for n in ("mean", "scale"))
+        potential.coefficients = torch.tensor(data["coefficients"], dtype=torch.float64)
+        return potential
 
     def monomials(self, observations: Tensor) -> Tensor:
         """All m_j of observations ``(n, ny)``, shape ``(n, size)`` in float64."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.datasets.transitions import Columns
+from mpcoffline.errors import MPCOfflineError
 from mpcoffline.mpc import MPC
 
 from .bellman import BellmanFit
@@ -18,6 +20,8 @@ from .coordinates import Coordinates, canonical
 from .potential import Potential
 
 Array = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
 
 
 class Refit(NamedTuple):
@@ -57,6 +61,9 @@ def refit_cost(
         prior: Weight of the squared distance to the MPC's parameters in scaled coordinates.
         shaped: Whether the stage cost has a potential besides.
         max_iterations: Bound on the iterations.
+
+    Raises:
+        MPCOfflineError: If the fit is lost.
     """
     nominal = Coordinates(mpc, ("cost",))
     start = Coordinates(mpc.with_theta(theta), ("cost",))
@@ -64,7 +71,7 @@ def refit_cost(
         target = problem.target(sample) - problem.predicted_value(sample, torch.from_numpy(theta))
         potential = Potential(sample.observations) if shaped else None
         shaping = _shaping(potential, problem, sample, theta)
-    offset = torch.from_numpy((theta - mpc.theta)[nominal.mask] / nominal.scale)
+    offset = torch.from_numpy(nominal.z(theta))
     ratio = torch.from_numpy(start.scale / nominal.scale)
 
     def residuals(z: Tensor) -> Tensor:
@@ -88,6 +95,12 @@ def refit_cost(
         bounds=[*zip(start.low, start.high, strict=True), *[(None, None)] * n_shaping],
         options={"maxiter": max_iterations},
     )
+    if not np.isfinite(found.x).all():
+        raise MPCOfflineError(
+            "(FIT)", expected="a finite cost", actual="NaN or inf in its weights", hint="Raise prior, or lower trim."
+        )
+    if found.nit >= max_iterations:
+        _log.info("(FIT) of the cost stopped at its bound of %d iterations", max_iterations)
     z = torch.from_numpy(found.x)
     fitted = canonical(mpc, start.theta(z[: start.size]).numpy())
     if potential is not None:

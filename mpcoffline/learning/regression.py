@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.transitions import TransitionTable
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .bellman import BellmanFit, PredictionError
@@ -26,6 +26,8 @@ from .value import ValueFunction, cosine
 Array = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
+
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # Adam's state; it does not count steps that were skipped
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class FitResult:
 
     Attributes:
         theta: The learned parameters, ``(size,)``.
-        loss_before: The regression error of (FIT) at theta_0, in units of the cost's variance.
+        loss_before: The regression error of (FIT) where it began, in units of the cost's variance.
         loss_after: The same at theta.
         at_bounds: Names of the learned parameters that ended on a bound.
         potential: The potential that was fitted with the cost, if one was.
@@ -88,13 +90,20 @@ class FitResult:
     potential: Potential | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON-able description, without theta and the potential, which the learned MPC's terminal cost has in it."""
-        return {"loss_before": self.loss_before, "loss_after": self.loss_after, "at_bounds": list(self.at_bounds)}
+        """A JSON-able description, without theta."""
+        return {
+            "loss_before": self.loss_before,
+            "loss_after": self.loss_after,
+            "at_bounds": list(self.at_bounds),
+            "potential": None if self.potential is None else self.potential.to_json(),
+        }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any], theta: Array) -> FitResult:
         """The inverse of :meth:`to_json`."""
-        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), tuple(map(str, data["at_bounds"])))
+        potential = None if data["potential"] is None else Potential.from_json(data["potential"])
+        at_bounds = tuple(map(str, data["at_bounds"]))
+        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential)
 
 
 class ParameterTraining:
@@ -126,7 +135,7 @@ class ParameterTraining:
         *,
         seed: int,
     ) -> None:
-        self._mpc, self._table, self.config = mpc, table, config
+        self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
         self._rng = np.random.default_rng(seed)
         self._problem = BellmanFit(mpc, value, float(table.costs.var(dtype=np.float64)) or 1.0)
         rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
@@ -152,7 +161,7 @@ class ParameterTraining:
         """The start of an attempt: the first from theta_0, others a little beside it and with shorter steps."""
         start = self._coordinates.start
         if self.attempt:
-            start = start + 0.1 * np.random.default_rng(self.attempt).normal(size=start.shape)
+            start = start + 0.1 * np.random.default_rng([self._seed, self.attempt]).normal(size=start.shape)
         z = torch.from_numpy(start)
         self._z = torch.minimum(torch.maximum(z, self._low), self._high).requires_grad_()
         self._optimiser = torch.optim.Adam([self._z], lr=self.config.learning_rate)
@@ -170,9 +179,12 @@ class ParameterTraining:
     def advance(self, n: int) -> Metrics:
         """Makes n more gradient steps, fewer at the end of an attempt; returns their mean regression error."""
         losses: list[float] = []
-        for _ in range(min(n, self.n_steps - self.step)):
+        made = min(n, self.n_steps - self.step)
+        for _ in range(made):
             self.step += 1
             losses += self._gradient_step()
+        if made and not losses:
+            _log.warning("(FIT) did not move in %d steps: no gradient was finite; has the model a sqrt at zero?", made)
         if self.done and self._failed() and self.attempt < self.config.n_restarts:
             self.attempt, self.step = self.attempt + 1, 0
             _log.warning(
@@ -209,7 +221,8 @@ class ParameterTraining:
             before, after = (
                 self._objective(self._coordinates.theta(z)) for z in (torch.zeros_like(self._z), self._z.detach())
             )
-        return not after <= before * (1.0 + 1e-3) + self.config.prior * float(self._z.detach().square().sum())
+        travelled = self.config.prior * float(self._z.detach().square().sum())
+        return not after + travelled <= before * (1.0 + 1e-3)
 
     def _objective(self, theta: torch.Tensor) -> float:
         error = self._problem.error(self._sample, theta)
@@ -241,10 +254,17 @@ class ParameterTraining:
         """What :meth:`restore` needs to go on bit for bit."""
         arrays = {"z": self._z.detach().numpy().copy(), "steps": np.array([self.attempt, self.step], dtype=np.float64)}
         moments = self._optimiser.state[self._z]
-        return arrays | {name: moments[name].numpy().copy() for name in ("exp_avg", "exp_avg_sq") if moments}
+        return arrays | {name: moments[name].numpy().copy() for name in _MOMENTS if moments}
 
     def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
-        """Takes over a state from :meth:`to_arrays` of a training with the same arguments."""
+        """Takes over a state from :meth:`to_arrays` of a training with the same arguments.
+
+        Raises:
+            FileFormatError: If arrays are missing.
+        """
+        missing = {"z", "steps"} - set(arrays)
+        if missing:
+            raise FileFormatError("state of (FIT)", expected="z and steps", actual=f"no {', '.join(sorted(missing))}")
         self.attempt, self.step = (int(n) for n in arrays["steps"])
         for _ in range(self.attempt * self.n_steps + self.step):
             next(self._batches)
@@ -252,8 +272,7 @@ class ParameterTraining:
         with torch.no_grad():
             self._z.copy_(torch.from_numpy(arrays["z"]))
         if "exp_avg" in arrays:
-            moments = {name: torch.from_numpy(arrays[name].copy()) for name in ("exp_avg", "exp_avg_sq")}
-            self._optimiser.state[self._z] = {"step": torch.tensor(float(self.step)), **moments}
+            self._optimiser.state[self._z] = {name: torch.from_numpy(np.array(arrays[name])) for name in _MOMENTS}
 
 
 def fit_parameters(

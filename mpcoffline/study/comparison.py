@@ -38,7 +38,7 @@ _HORIZONS = ("default", "fast", "best")
 
 @dataclass(frozen=True)
 class Group:
-    """Cases of one task that share the data, and so the value functions.
+    """Cases of one task that share the data, and so the value functions, which are learned in the first case.
 
     Attributes:
         task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
@@ -77,7 +77,7 @@ class Row:
         controller: Its name.
         cost: Undiscounted cost J.
         discounted_cost: Jd, with gamma = 0.9.
-        up: Share of the episodes that end in success.
+        up: Share of the episodes that end in success; None where that was not looked at.
         failures: MPCs whose solution was not accepted.
         fit_time: Seconds of the fit, without (VALUE) where that was shared; None where nothing was learned.
     """
@@ -88,7 +88,7 @@ class Row:
     controller: str
     cost: float
     discounted_cost: float
-    up: float
+    up: float | None
     failures: int = 0
     fit_time: float | None = None
 
@@ -121,12 +121,11 @@ class _Arena:
         """The best costs of whole episodes, from the actions of the controllers that ran here among others."""
         states = initial_states(self.setup.make_env(), self.starts, FIRST_START)
         costs = [best_known_costs(self.group.task, states, self.actions, gamma).mean() for gamma in (1.0, 0.9)]
-        return self._row("best known", *costs, 1.0)
+        return self._row("best known", *costs, None)
 
-    def _row(self, name: str, cost: float, discounted: float, up: float, *rest: Any) -> Row:
-        return Row(
-            self.group.name, self.setup.alpha, self.setup.seed, name, float(cost), float(discounted), float(up), *rest
-        )
+    def _row(self, name: str, cost: float, discounted: float, up: float | None, *rest: Any) -> Row:
+        case = self.group.name, self.setup.alpha, self.setup.seed
+        return Row(*case, name, float(cost), float(discounted), None if up is None else float(up), *rest)
 
 
 def run_group(group: Group, n_episodes: int) -> list[Row]:
@@ -146,6 +145,7 @@ def run_group(group: Group, n_episodes: int) -> list[Row]:
         run = _linear_rows if group.task == "linear" else _swing_up_rows
         rows += run(arena, table, values)
     if group.task != "linear" and group.condition == "clean":
+        arenas[0].actions = [actions for arena in arenas for actions in arena.actions]
         rows.append(arenas[0].best_known())
     return rows
 

@@ -26,6 +26,33 @@ def training(mpc: MPC | None = None, groups: tuple[str, ...] = BOTH, **options: 
     return ParameterTraining(mpc or lq_plant.make_mpc(), value, lq_plant.random_log(400), groups, config, seed=0)
 
 
+def test_going_on_after_a_skipped_step_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    honest, calls = BellmanFit.error, 0
+
+    def faulty(self: BellmanFit, batch: Any, theta: torch.Tensor) -> torch.Tensor:
+        nonlocal calls
+        calls += theta.requires_grad
+        return honest(self, batch, theta) * (torch.nan if theta.requires_grad and calls == 5 else 1.0)
+
+    monkeypatch.setattr(BellmanFit, "error", faulty)
+    whole = training()
+    whole.advance(20)
+    arrays = whole.to_arrays()
+    whole.advance(40)
+    part = training()
+    part.restore(arrays)
+    part.advance(40)
+    np.testing.assert_array_equal(part.theta, whole.theta)
+
+
+def test_no_finite_gradient_at_all_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    fit = training()
+    honest = BellmanFit.error
+    monkeypatch.setattr(BellmanFit, "error", lambda *arguments: torch.nan * honest(*arguments))
+    fit.advance(5)
+    assert "(FIT) did not move in 5 steps: no gradient was finite" in caplog.text
+
+
 @pytest.mark.parametrize("stops", [(1,), (20, 45), (60,)])
 def test_going_on_gives_the_same_bits(stops: tuple[int, ...]) -> None:
     whole = training()
@@ -69,8 +96,9 @@ def test_with_a_large_weight_the_model_is_identified() -> None:
     assert errors[1] < 0.02 < errors[0]
 
 
-def test_a_fit_that_runs_off_begins_again_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    fit = training(learning_rate=50.0, n_steps=5, n_restarts=2, prior=0.0)
+@pytest.mark.parametrize("prior", [0.0, 10.0])
+def test_a_fit_that_runs_off_begins_again_and_says_so(caplog: pytest.LogCaptureFixture, prior: float) -> None:
+    fit = training(learning_rate=50.0, n_steps=5, n_restarts=2, prior=prior)
     with caplog.at_level(logging.WARNING):
         while not fit.done:
             fit.advance(5)
@@ -80,7 +108,21 @@ def test_a_fit_that_runs_off_begins_again_and_says_so(caplog: pytest.LogCaptureF
     assert "failed in every attempt; the model stays as it was" in caplog.text
     mpc = lq_plant.make_mpc()
     np.testing.assert_array_equal(mpc.with_theta(result.theta).values["model.A"], lq_plant.MODEL_A)
-    assert result.loss_after < result.loss_before  # the cost is fitted all the same
+    assert result.loss_after < result.loss_before or prior > 0.0  # the cost is fitted all the same
+
+
+def test_a_fixed_parameter_is_on_no_bound() -> None:
+    model = Model(
+        lambda x, u, p: lq_plant.A @ x + p["gain"] * ca.DM(lq_plant.B) @ u,
+        2,
+        1,
+        0.1,
+        {"gain": Parameter(1.0, low=1.0, high=1.0)},
+        discrete=True,
+    )
+    fit = training(lq_plant.make_mpc().replace(model=model), n_steps=5)
+    fit.advance(5)
+    assert fit.finish().at_bounds == ()
 
 
 def test_parameters_that_end_on_a_bound_are_named(caplog: pytest.LogCaptureFixture) -> None:

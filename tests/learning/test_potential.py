@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import lq_plant
 import numpy as np
 import pytest
@@ -29,6 +31,14 @@ def test_it_is_every_polynomial_of_degree_two_without_constant() -> None:
     expected = np.column_stack([z, *squares]) @ potential.coefficients.numpy()
     np.testing.assert_allclose(potential(s).numpy(), expected, rtol=1e-12, atol=1e-12)
     assert potential(torch.from_numpy(s.mean(0).numpy()[None])).abs() < 1e-12
+
+
+def test_it_survives_json() -> None:
+    s = torch.from_numpy(np.random.default_rng(1).normal(size=(20, 2)))
+    potential = Potential(s)
+    potential.coefficients += 0.3
+    again = Potential.from_json(json.loads(json.dumps(potential.to_json())))
+    np.testing.assert_array_equal(again(s).numpy(), potential(s).numpy())
 
 
 def test_a_constant_coordinate_does_no_harm() -> None:
