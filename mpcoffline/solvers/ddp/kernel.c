@@ -30,9 +30,10 @@ typedef struct {
     int64_t n;
     const double *x0, *theta, *u0; /* (n, NX), (n, NP) or (NP), (n, NU) or NULL */
     int64_t theta_stride;          /* NP, or 0: one theta for all */
-    double *x, *u, *J, *predicted;  /* (n, N+1, NX), (n, N, NU): guess in, solution out; (n), (n) */
+    double *x, *u, *J, *predicted; /* solution: (n, N+1, NX), (n, N, NU), (n), (n) */
     int64_t *iterations, *status;  /* (n) */
-    int cold;                       /* the guess is inputs only */
+    int cold;                      /* the guess is inputs only */
+    const double *x_guess, *u_guess; /* as x, u, and may be these */
 } mpc_batch;
 
 /* One theta for all lanes. */
@@ -50,11 +51,11 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
         w->high0[a][lane] = b->u0 ? b->u0[i * NU + a] : m->high[a];
     }
     for (int64_t k = 0; k < N * NU; ++k) {
-        double v = b->u[i * N * NU + k], low = m->low[k % NU], high = m->high[k % NU];
+        double v = b->u_guess[i * N * NU + k], low = m->low[k % NU], high = m->high[k % NU];
         if (b->u0 && k < NU) low = high = b->u0[i * NU + k];
         w->u[k][lane] = v < low ? low : v > high ? high : v;
     }
-    for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x[i * (N + 1) * NX + k];
+    for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
     for (int j = 0; j < NX; ++j) w->x[j][lane] = w->s[j][lane];
     w->J[lane] = INFINITY;
     w->mu[lane] = 0.0;
@@ -219,8 +220,8 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
     if (!failed) {
         double *q = memory + n_candidates;
         mpc_batch starts = {.n = n_starts, .cold = 1, .iterations = flags, .status = flags + n_starts};
-        starts.x = q; q += n_starts * (N + 1) * NX;
-        starts.u = q; q += n_starts * N * NU;
+        starts.x = q, starts.x_guess = q; q += n_starts * (N + 1) * NX;
+        starts.u = q, starts.u_guess = q; q += n_starts * N * NU;
         starts.x0 = q; q += n_starts * NX;
         starts.u0 = b->u0 ? q : NULL; q += n_starts * NU;
         starts.J = q; q += n_starts;

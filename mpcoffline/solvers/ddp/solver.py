@@ -54,6 +54,8 @@ class _Batch(ctypes.Structure):
         ("iterations", c_void_p),
         ("status", c_void_p),
         ("cold", c_int),
+        ("x_guess", c_void_p),
+        ("u_guess", c_void_p),
     )
 
 
@@ -176,8 +178,7 @@ class DDPSolver(Solver):
             address["u0"] = None
         else:
             block["u0"][:] = u0
-        if plan is not None:
-            block["x"][:], block["u"][:] = plan
+        guess = (block["x"], block["u"]) if plan is None else [np.ascontiguousarray(a, np.float64) for a in plan]
         counts = np.empty((2, n), np.int64)
         where = counts.ctypes.data
         batch = _Batch(
@@ -186,6 +187,8 @@ class DDPSolver(Solver):
             theta_stride=theta.shape[1] if theta.ndim == 2 else 0,
             iterations=where,
             status=where + counts.strides[0],
+            x_guess=guess[0].ctypes.data,
+            u_guess=guess[1].ctypes.data,
             **address,
         )
         failed = self._call(batch, cold=plan is None)
