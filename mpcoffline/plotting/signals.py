@@ -1,107 +1,18 @@
-"""Figures: one style for all of them, readable in print and for the colour-blind, as vector PDF and PNG."""
+"""Quantities of closed loops over time, and bars of what they cost."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from .panels import in_pi, unwrapped
+from .style import BOUND, OTHER, STYLES, Array, controller_label, line_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
-
-COLUMN_WIDTH = 3.5
-PAGE_WIDTH = 7.16
-_PNG_DPI = 200
-
-
-@dataclass(frozen=True)
-class LineStyle:
-    """How one curve is told from the others: by colour (Okabe-Ito), and in black and white by its dashes.
-
-    Attributes:
-        color: Colour.
-        dashes: Matplotlib line style.
-        width: Line width in points.
-    """
-
-    color: str
-    dashes: Any = "-"
-    width: float = 1.4
-
-
-#: The controllers of the study in every figure; other names get :data:`OTHER`.
-STYLES: dict[str, LineStyle] = {
-    "MPC_1": LineStyle("#D55E00", (0, (5, 1.6))),
-    "MPC_2": LineStyle("#009E73", (0, (4, 1.2, 1, 1.2))),
-    "MPC_3": LineStyle("#0072B2", "-", 1.7),
-    "reference": LineStyle("#000000", (0, (1, 1.2)), 1.2),
-}
-OTHER = LineStyle("#CC79A7", (0, (1, 1)))
-_BOUND = "#767676"
-
-
-@contextmanager
-def paper_style() -> Iterator[None]:
-    """The style of all figures: small sans-serif text, thin axes, embedded fonts."""
-    import matplotlib as mpl
-
-    settings: dict[str, Any] = {
-        "font.size": 8.0,
-        "axes.titlesize": 8.0,
-        "axes.labelsize": 8.0,
-        "xtick.labelsize": 7.0,
-        "ytick.labelsize": 7.0,
-        "legend.fontsize": 8.0,
-        "axes.linewidth": 0.6,
-        "xtick.major.width": 0.6,
-        "ytick.major.width": 0.6,
-        "xtick.major.size": 2.5,
-        "ytick.major.size": 2.5,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "grid.color": "#E6E6E6",
-        "grid.linewidth": 0.5,
-        "legend.frameon": False,
-        "mathtext.fontset": "dejavusans",
-        "pdf.fonttype": 42,  # TrueType: publishers refuse Type 3
-        "hatch.linewidth": 0.5,
-    }
-    rc_context: Any = mpl.rc_context  # its stubs name every key
-    with rc_context(settings):
-        yield
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure in inches that no window and no global state knows of; make it inside :func:`paper_style`."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def save_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Writes a figure as vector PDF and as PNG; equal figures give equal files.
-
-    Args:
-        figure: The figure.
-        stem: Path without suffix.
-
-    Returns:
-        The two files.
-    """
-    pdf, png = stem.with_name(f"{stem.name}.pdf"), stem.with_name(f"{stem.name}.png")
-    figure.savefig(pdf, metadata={"CreationDate": None, "Creator": None, "Producer": None})
-    figure.savefig(png, dpi=_PNG_DPI, metadata={"Software": None})
-    return [pdf, png]
 
 
 @dataclass(frozen=True)
@@ -141,9 +52,9 @@ def draw_signal(axes: Axes, signal: Signal, dt: float) -> None:
         style = STYLES.get(name, OTHER)
         times = dt * np.arange(len(values), dtype=np.float64)
         if signal.held:
-            axes.stairs(values, dt * np.arange(len(values) + 1), baseline=None, **_line(style), zorder=3)
+            axes.stairs(values, dt * np.arange(len(values) + 1), baseline=None, **line_of(style), zorder=3)
         else:
-            axes.plot(times, _unwrapped(values) if signal.angle else values, **_line(style), zorder=3)
+            axes.plot(times, unwrapped(values) if signal.angle else values, **line_of(style), zorder=3)
     if signal.bounds is not None:
         _draw_bounds(axes, *signal.bounds)
     if signal.angle:
@@ -190,29 +101,11 @@ def draw_bars(axes: Axes, groups: Mapping[str, Mapping[str, float]], unit: float
     axes.set_ylim(0.0, 1.14 * max(top, unit or 0.0))
 
 
-def controller_label(name: str) -> str:
-    """The name of a controller as it is set in a figure: ``MPC_1`` with its index lowered."""
-    stem, _, index = name.partition("_")
-    return f"{stem}$_{{{index}}}$" if index else stem
-
-
-def legend_handles(names: Sequence[str]) -> tuple[list[Any], list[str]]:
-    """Handles and labels of a legend for controllers."""
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], **_line(STYLES.get(name, OTHER))) for name in names]
-    return handles, [controller_label(name) for name in names]
-
-
-def _line(style: LineStyle) -> dict[str, Any]:
-    return {"color": style.color, "linestyle": style.dashes, "linewidth": style.width}
-
-
 def _draw_turns(axes: Axes, signal: Signal) -> None:
     """Ticks at half turns, and target and band at every full turn that is in sight."""
     low, high = axes.get_ylim()
     ticks = range(int(np.ceil(low / np.pi)), int(np.floor(high / np.pi)) + 1)
-    axes.set_yticks([np.pi * k for k in ticks], [_in_pi(k) for k in ticks])
+    axes.set_yticks([np.pi * k for k in ticks], [in_pi(k) for k in ticks])
     if signal.target is None:
         return
     margin = signal.band or 0.0
@@ -223,20 +116,8 @@ def _draw_turns(axes: Axes, signal: Signal) -> None:
     axes.set_ylim(low, high)
 
 
-def _unwrapped(angle: Array) -> Array:
-    """The angle without jumps, starting in [0, 2 pi)."""
-    curve = np.unwrap(angle)
-    return np.asarray(curve - 2 * np.pi * np.floor(curve[0] / (2 * np.pi)))
-
-
-def _in_pi(k: int) -> str:
-    if k == 0:
-        return "0"
-    return f"${'-' if k < 0 else ''}{'' if abs(k) == 1 else abs(k)}\\pi$"
-
-
 def _draw_target(axes: Axes, target: float, band: float | None) -> None:
-    axes.axhline(target, color=_BOUND, linewidth=0.6, zorder=1)
+    axes.axhline(target, color=BOUND, linewidth=0.6, zorder=1)
     if band is not None:
         axes.axhspan(target - band, target + band, color="#EAEAEA", linewidth=0, zorder=0)
 
@@ -249,7 +130,7 @@ def _draw_bounds(axes: Axes, low: float, high: float) -> None:
         return
     margin = 0.12 * (high - low)
     for bound, side in ((low, -1.0), (high, 1.0)):
-        axes.axhline(bound, color=_BOUND, linewidth=0.8, zorder=2)
+        axes.axhline(bound, color=BOUND, linewidth=0.8, zorder=2)
         axes.axhspan(
             bound, bound + side * margin, facecolor="#EDEDED", hatch="////", edgecolor="#C4C4C4", linewidth=0, zorder=1
         )

@@ -1,0 +1,50 @@
+"""Figures: one style for all of them, readable in print and for the colour-blind, as vector PDF and PNG.
+
+A learner's: :func:`training_figure`, :func:`cost_figure`, :func:`loop_figure`, :func:`phase_portrait`; and
+:func:`animate`, which puts controllers side by side as a film. ``mpcoffline plot LEARNER`` makes them all.
+"""
+
+from __future__ import annotations
+
+from .animation import animate, check_film
+from .costs import cost_figure
+from .loops import loop_figure
+from .portrait import phase_portrait
+from .signals import Signal, draw_bars, draw_signal
+from .style import (
+    COLUMN_WIDTH,
+    OTHER,
+    PAGE_WIDTH,
+    STYLES,
+    Array,
+    LineStyle,
+    controller_label,
+    legend_handles,
+    new_figure,
+    paper_style,
+    save_figure,
+)
+from .training import training_figure
+
+__all__ = [
+    "COLUMN_WIDTH",
+    "OTHER",
+    "PAGE_WIDTH",
+    "STYLES",
+    "Array",
+    "LineStyle",
+    "Signal",
+    "animate",
+    "check_film",
+    "controller_label",
+    "cost_figure",
+    "draw_bars",
+    "draw_signal",
+    "legend_handles",
+    "loop_figure",
+    "new_figure",
+    "paper_style",
+    "phase_portrait",
+    "save_figure",
+    "training_figure",
+]

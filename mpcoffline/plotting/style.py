@@ -1,0 +1,148 @@
+"""The style of all figures, readable in print and for the colour-blind, and how they become files."""
+
+from __future__ import annotations
+
+import io
+import os
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+COLUMN_WIDTH = 3.5
+PAGE_WIDTH = 7.16
+_PNG_DPI = 200
+
+
+@dataclass(frozen=True)
+class LineStyle:
+    """How one curve is told from the others: by colour (Okabe-Ito), and in black and white by its dashes.
+
+    Attributes:
+        color: Colour.
+        dashes: Matplotlib line style.
+        width: Line width in points.
+    """
+
+    color: str
+    dashes: Any = "-"
+    width: float = 1.4
+
+
+#: The controllers of the study in every figure; other names get :data:`OTHER`.
+STYLES: dict[str, LineStyle] = {
+    "MPC_1": LineStyle("#D55E00", (0, (5, 1.6))),
+    "MPC_2": LineStyle("#009E73", (0, (4, 1.2, 1, 1.2))),
+    "MPC_3": LineStyle("#0072B2", "-", 1.7),
+    "reference": LineStyle("#000000", (0, (1, 1.2)), 1.2),
+}
+OTHER = LineStyle("#CC79A7", (0, (1, 1)))
+BOUND = "#767676"
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """The style of all figures: small sans-serif text, thin axes, embedded fonts."""
+    import matplotlib as mpl
+
+    settings: dict[str, Any] = {
+        "font.size": 8.0,
+        "axes.titlesize": 8.0,
+        "axes.labelsize": 8.0,
+        "xtick.labelsize": 7.0,
+        "ytick.labelsize": 7.0,
+        "legend.fontsize": 8.0,
+        "axes.linewidth": 0.6,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "xtick.major.size": 2.5,
+        "ytick.major.size": 2.5,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "grid.color": "#E6E6E6",
+        "grid.linewidth": 0.5,
+        "legend.frameon": False,
+        "mathtext.fontset": "dejavusans",
+        "pdf.fonttype": 42,  # TrueType: publishers refuse Type 3
+        "hatch.linewidth": 0.5,
+    }
+    rc_context: Any = mpl.rc_context  # its stubs name every key
+    with rc_context(settings):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure in inches that no window and no global state knows of; make it inside :func:`paper_style`."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(figure: Figure, stem: Path) -> list[Path]:
+    """Writes a figure as vector PDF and as PNG; equal figures give equal files.
+
+    Args:
+        figure: The figure.
+        stem: Path without suffix.
+
+    Returns:
+        The two files.
+    """
+    files = []
+    for suffix, metadata in (("pdf", ("CreationDate", "Creator", "Producer")), ("png", ("Software",))):
+        content = io.BytesIO()
+        figure.savefig(content, format=suffix, dpi=_PNG_DPI, metadata=dict.fromkeys(metadata))
+        files.append(write_whole(stem.with_name(f"{stem.name}.{suffix}"), content.getvalue()))
+    return files
+
+
+def write_whole(path: Path, content: bytes) -> Path:
+    """Writes a file that is complete or not there: an interruption leaves what was there before.
+
+    Args:
+        path: The file; its folder is made where it is missing.
+        content: What it holds.
+
+    Returns:
+        The path.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    return path
+
+
+def controller_label(name: str) -> str:
+    """The name of a controller as it is set in a figure: ``MPC_1`` with its index lowered."""
+    stem, _, index = name.partition("_")
+    return f"{stem}$_{{{index}}}$" if index else stem
+
+
+def legend_handles(names: Sequence[str]) -> tuple[list[Any], list[str]]:
+    """Handles and labels of a legend for controllers."""
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], **line_of(STYLES.get(name, OTHER))) for name in names]
+    return handles, [controller_label(name) for name in names]
+
+
+def line_of(style: LineStyle) -> dict[str, Any]:
+    """The style as keyword arguments of Matplotlib's lines."""
+    return {"color": style.color, "linestyle": style.dashes, "linewidth": style.width}
