@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-console = Console()
+from mpcoffline.cli_common import Json, console, examples, print_json, say
+
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="The data sets on this machine.")
 
 FOUND_WRONG = 1
@@ -22,31 +23,45 @@ Remote = Annotated[
 ]
 
 
-@app.command("list")
-def list_() -> None:
+@app.command("list", epilog=examples("mpcoffline datasets list", "mpcoffline datasets list --json"))
+def list_(as_json: Json = False) -> None:
     """The data sets that can be learned from: shipped with the package, or in the local Minari store."""
     from mpcoffline.datasets import list_datasets
 
+    rows = list_datasets()
+    if as_json:
+        print_json([asdict(row) for row in rows])
+        return
     table = Table(box=None, pad_edge=False)
     for name in ("id", "where", "episodes", "transitions"):
         table.add_column(name, justify="right" if name in ("episodes", "transitions") else "left", no_wrap=True)
-    for row in list_datasets():
+    for row in rows:
         table.add_row(row.id, row.where, str(row.episodes), str(row.steps))
     console.print(table)
 
 
-@app.command(epilog="Example:\n\nmpcoffline datasets show mpcoffline/pendulum/ddpg-v0 --figure coverage.png")
+@app.command(
+    epilog=examples(
+        "mpcoffline datasets show mpcoffline/pendulum/ddpg-v0 --figure coverage.png",
+        "mpcoffline datasets show mpcoffline/linear/ddpg-v0 --json",
+    )
+)
 def show(
     dataset_id: Id,
     figure: Annotated[Path | None, typer.Option(help="File for a plot of what the data cover.", dir_okay=False)] = None,
+    as_json: Json = False,
 ) -> None:
     """The card and the statistics of a data set."""
     from mpcoffline.datasets import show as summarise
 
-    console.print(summarise(dataset_id, figure))
+    summary = summarise(dataset_id, figure)
+    if as_json:
+        print_json(asdict(summary))
+    else:
+        console.print(summary)
 
 
-@app.command()
+@app.command(epilog=examples("mpcoffline datasets verify mpcoffline/pendulum/ddpg-v0"))
 def verify(dataset_id: Id) -> None:
     """Check a data set: structure, hashes, NaN, bounds, alignment, reward = -cost.
 
@@ -59,7 +74,7 @@ def verify(dataset_id: Id) -> None:
     raise typer.Exit(0 if report.ok else FOUND_WRONG)
 
 
-@app.command()
+@app.command(epilog=examples("mpcoffline datasets replay mpcoffline/pendulum/ddpg-v0 --episodes 10"))
 def replay(
     dataset_id: Id,
     episodes: Annotated[int | None, typer.Option(help="How many, spread evenly.", show_default="all", min=1)] = None,
@@ -78,15 +93,15 @@ def replay(
     raise typer.Exit(0 if report.ok else FOUND_WRONG)
 
 
-@app.command()
+@app.command(epilog=examples("mpcoffline datasets repair mine/pendulum/first-v0"))
 def repair(dataset_id: Id) -> None:
     """Finish or rebuild what a killed recording left; what is found is kept as a backup."""
     from mpcoffline.datasets import repair as mend
 
-    console.print(escape(str(mend(dataset_id))), highlight=False)
+    say(escape(str(mend(dataset_id))))
 
 
-@app.command(epilog="Example:\n\nmpcoffline datasets download mine/plant/log-v0 --remote hf://my-organisation")
+@app.command(epilog=examples("mpcoffline datasets download mine/plant/log-v0 --remote hf://my-organisation"))
 def download(
     dataset_id: Id,
     remote: Remote = None,
@@ -107,9 +122,9 @@ def download(
     console.print(f"{escape(dataset_id)}: {dataset.total_episodes} episodes, {dataset.total_steps} steps.")
 
 
-@app.command()
+@app.command(epilog=examples("mpcoffline datasets upload mine/pendulum/first-v0 --remote hf://my-organisation"))
 def upload(dataset_id: Id, remote: Remote = None) -> None:
     """Put a data set on a Minari remote, with the hashes that a download is checked against."""
     from mpcoffline.datasets import upload_dataset
 
-    console.print(escape(str(upload_dataset(dataset_id, remote=remote))), highlight=False, soft_wrap=True)
+    say(escape(str(upload_dataset(dataset_id, remote=remote))))

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: help, one-line errors with exit code 2, files."""
+"""The command line as a user meets it: help, one-line errors with exit code 1, files."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner, Result
 
 import mpcoffline
@@ -39,7 +40,8 @@ def plain(result: Result) -> str:
 def refused(*arguments: str | Path) -> str:
     """The one line of an error."""
     result = call(*arguments)
-    assert result.exit_code == 2, result.output
+    assert result.exit_code == 1, result.output
+    assert result.stdout == ""
     assert isinstance(result.exception, SystemExit), "no traceback"
     lines = [line for line in plain(result).splitlines() if line.strip()]
     assert len(lines) == 1, lines
@@ -47,13 +49,23 @@ def refused(*arguments: str | Path) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", ["run", "collect", "learn", "evaluate", "datasets", "datasets list"])
-def test_every_command_has_help_with_its_options(command: str) -> None:
+COMMANDS = ["run", "collect", "learn", "evaluate", "diagnose", "plot", "export", "doctor"]
+DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
+
+
+def test_the_commands_are_these() -> None:
+    group = typer.main.get_group(app)
+    context = group.make_context("mpcoffline", ["datasets"])
+    assert group.list_commands(context) == [*COMMANDS, "datasets"]
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, *DATASETS])
+def test_every_command_has_help_with_examples(command: str) -> None:
     result = call(*command.split(), "--help")
     assert result.exit_code == 0
     assert "Usage: " in plain(result)
+    assert f"mpcoffline {command}" in re.split("Examples?:", plain(result))[1]
     if command in ("run", "collect", "learn", "evaluate"):
-        assert f"mpcoffline {command} " in plain(result).split("Examples:")[1]
         assert "--seed" in plain(result)
 
 
@@ -76,7 +88,7 @@ def test_help_loads_nothing_heavy() -> None:
 def test_the_installed_command_shows_errors_without_traceback() -> None:
     command = [str(Path(sys.executable).parent / "mpcoffline"), "run", "pendulum", "--dataset", "mpcoffline/nope-v0"]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 2
+    assert done.returncode == 1
     assert done.stdout == ""
     assert done.stderr.startswith("Error: data set id: expected one of ")
     assert "Traceback" not in done.stderr
@@ -156,7 +168,8 @@ def test_learn_saves_learner_and_policy(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("mpcoffline.learner.OfflineMPCLearner", Brief)
     result = call(
-        "learn", "--dataset", "mpcoffline/pendulum/ddpg-v0", "--learn", "cost", "--value", "td", "--seed", "2"
+        *("learn", "--dataset", "mpcoffline/pendulum/ddpg-v0", "--preset", "paper"),
+        *("--learn", "cost", "--value", "td", "--seed", "2"),
     )
     assert result.exit_code == 0, result.output
     learner = OfflineMPCLearner.load(tmp_path / "learner.zip")

@@ -58,10 +58,25 @@ def test_verify_says_what_is_wrong(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["show", "verify", "replay", "repair", "upload"])
 def test_unknown_ids_are_refused(command: str) -> None:
     code, _ = run(command, "mpcoffline/linear/dpg-v0")
-    assert code == 2
+    assert code == 1
 
 
 def test_downloading_without_a_remote_says_how_to_set_one() -> None:
     result = CliRunner().invoke(app, ["datasets", "download", "mine/plant/log-v0"])
-    assert result.exit_code == 2
+    assert result.exit_code == 1
     assert "MINARI_REMOTE" in result.stderr
+
+
+def test_list_as_json_is_one_document() -> None:
+    result = CliRunner().invoke(app, ["datasets", "list", "--json"])
+    rows = json.loads(result.stdout)
+    assert {"id": SHIPPED, "where": "shipped", "episodes": 500, "steps": 50000} in rows
+
+
+@pytest.mark.slow
+def test_show_as_json_has_the_numbers() -> None:
+    result = CliRunner().invoke(app, ["datasets", "show", SHIPPED, "--json"])
+    summary = json.loads(result.stdout)
+    assert summary["dataset_id"] == SHIPPED
+    lengths = next(row for row in summary["statistics"] if row["name"] == "steps of an episode")
+    assert lengths["mean"] == 100.0

@@ -1,0 +1,95 @@
+"""The doctor: what it finds here, and what it says when something is broken."""
+
+from __future__ import annotations
+
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from mpcoffline import doctor
+from mpcoffline.cli import app
+
+
+@pytest.fixture(autouse=True)
+def own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "minari").mkdir()
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+
+def by_name(found: dict[str, Any]) -> dict[str, dict[str, str]]:
+    return {check["name"]: check for check in found["checks"]}
+
+
+def test_here_everything_needed_works() -> None:
+    result = CliRunner().invoke(app, ["doctor", "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    checks = by_name(found)
+    assert found["ok"] is True
+    assert checks["Python"]["found"].startswith(platform.python_version())
+    assert {checks[name]["status"] for name in ("torch", "casadi", "solver lqr", "solver ipopt", "data sets")} == {"ok"}
+    assert checks["data sets"]["found"] == "3 shipped, 0 local"
+    assert all(check["advice"] for check in checks.values() if check["status"] != "ok")
+
+
+def only(monkeypatch: pytest.MonkeyPatch, *examinations: str) -> None:
+    monkeypatch.setattr(doctor, "_EXAMINATIONS", tuple(getattr(doctor, name) for name in examinations))
+
+
+def test_without_a_compiler_it_warns_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    only(monkeypatch, "_compiler", "_solvers")
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("warn  C compiler: none -> Install gcc or clang")
+    assert any(line.startswith("warn  solver ddp:") for line in lines)
+    assert any(line.startswith("ok    solver ipopt:") for line in lines)
+
+
+def test_a_compiler_that_fails_is_found_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    only(monkeypatch, "_compiler")
+    broken = tmp_path / "cc"
+    broken.write_text("#!/bin/sh\necho no licence >&2\nexit 3\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    check = by_name(doctor.diagnosis())["C compiler"]
+    assert check["status"] == "warn"
+    assert "no licence" in check["found"]
+
+
+def test_a_missing_needed_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, "_versions")
+    monkeypatch.setattr(doctor, "_NEEDED", ("numpy", "a-package-that-nobody-has"))
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 1
+    assert "fail  a-package-that-nobody-has: not installed -> Run: pip install" in result.stdout
+
+
+def test_missing_optional_packages_name_their_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, "_optional_packages")
+    monkeypatch.setattr(doctor, "_version", lambda _: None)
+    found = doctor.diagnosis()
+    assert found["ok"] is True
+    assert 'pip install "mpcoffline[render]"' in by_name(found)["pygame"]["advice"]
+
+
+def test_a_store_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert doctor._writable(tmp_path / "new" / "folder")
+    assert not doctor._writable(tmp_path / "file" / "folder")
+
+
+def test_what_breaks_unforeseen_is_a_failed_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    def _hardware() -> Any:
+        raise RuntimeError("driver lost")
+
+    monkeypatch.setattr(doctor, "_EXAMINATIONS", (_hardware,))
+    found = doctor.diagnosis()
+    assert found["ok"] is False
+    assert by_name(found)["hardware"]["found"] == "RuntimeError: driver lost"
