@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -106,3 +107,15 @@ def test_diagnose_prints_the_report_or_its_json(files: Path, monkeypatch: pytest
     assert text.stdout.splitlines() == ["Verdict: recommend [of a learner]", "Figure: report.png"]
     document = json.loads(call(*arguments, "--json").stdout)
     assert document == {"verdict": "recommend", "files": ["report.png"]}
+
+
+@pytest.mark.parametrize(
+    ("work", "command"),
+    [("mpcoffline.evaluate", ["plot"]), ("mpcoffline.diagnostics.diagnose", ["diagnose", "--dataset", DATA])],
+)
+def test_ctrl_c_leaves_no_files(files: Path, work: str, command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    result = call(*command, files / "learner.zip")
+    assert result.exit_code == 130
+    assert result.stderr.strip().splitlines()[-1] == "Interrupted."
+    assert {path.name for path in Path().iterdir()} == {"minari"}
