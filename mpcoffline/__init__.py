@@ -15,6 +15,7 @@ import mpcoffline.envs  # noqa: F401 -- registers the environments
 
 if TYPE_CHECKING:
     from mpcoffline.datasets import MinariRecorder, TransitionTable, collect, list_datasets, load_dataset
+    from mpcoffline.diagnostics import diagnose
     from mpcoffline.errors import (
         FileFormatError,
         InvalidArgumentError,
@@ -62,6 +63,7 @@ _HOMES = {
     "MPCModel": "sb3",
     "MPCPolicy": "policy",
     "OfflineMPCLearner": "learner",
+    "diagnose": "diagnostics",
     "nominal_mpc": "tasks",
     "evaluate": "evaluation",
     "MinariRecorder": "datasets",
@@ -102,6 +104,7 @@ __all__ = [
     "UnknownIdError",
     "__version__",
     "collect",
+    "diagnose",
     "evaluate",
     "list_datasets",
     "load_dataset",

@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from mpcoffline.cli import app
 from mpcoffline.datasets.minari_store import shipped_datasets
-from mpcoffline.learner import PRESETS, LearnerConfig
-from mpcoffline.learning import FitConfig, ValueConfig
+from mpcoffline.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -28,8 +27,8 @@ def test_the_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.chdir(tmp_path)
     # Whether learning succeeds is tested elsewhere; here it is brief.
-    brief = LearnerConfig(value=ValueConfig(n_steps=200), fit=FitConfig(n_steps=50, refit_rows=2000))
-    monkeypatch.setitem(PRESETS, "paper", brief)
+    brief = PRESETS["default"].replaced({"value_n_steps": 200, "refit_rows": 2000, "terminal": "quadratic"})
+    monkeypatch.setitem(PRESETS, "default", brief)
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-2, 2, (2000, 2)), rng.uniform(-2, 2, (2000, 1))
     names: dict[str, object] = {  # what the README calls "your log": a sledge of another mass
