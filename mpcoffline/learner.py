@@ -191,10 +191,10 @@ class OfflineMPCLearner:
                 self.history = history
                 if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
                     saved.write(fit, history)
-                stop = any([callback(self, len(history), epoch.total_step) is False for callback in callbacks])
+                answers = [callback(self, len(history), epoch.total_step) for callback in callbacks]
                 progress.show(epoch)
                 yield history[-1]
-                if stop:
+                if any(answer is False for answer in answers):
                     return
 
     @property

@@ -213,7 +213,8 @@ int main(void) {
         for (int i = 0; i < n; ++i)
             for (int k = 0; k < NP; ++k) theta[i * NP + k] = given[k];
         int64_t stride = round % 3 ? NP : 0;
-        mpc_batch batch = {n, x0, theta, round % 2 ? u0 : NULL, stride, x, u, J, predicted, iterations, status, 0, x, u};
+        mpc_batch batch = {n, x0, theta, round % 2 ? u0 : NULL, stride, x, u, J, predicted, iterations, status, 0,
+                           x, u};
         for (int64_t part = 0; part < 2; ++part)
             if (mpc_solve_cold(&problem, &batch, candidates, M, 8, part, 2)) return 1;
         for (int k = 0; k < n * NX; ++k) x0[k] += 0.1 * uniform();
