@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 from hypothesis import settings
 
@@ -12,3 +13,7 @@ settings.load_profile("suite")
 
 # No test asks a remote that the user has configured.
 os.environ.pop("MINARI_REMOTE", None)
+
+# Where a shell starts the tests in the background, Ctrl-C is ignored, and what it does could not be tested.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -204,11 +204,11 @@ def test_fit_returns_the_history() -> None:
 
 def test_a_progress_bar_can_be_drawn(capsys: pytest.CaptureFixture[str]) -> None:
     quick().fit(lq_plant.random_log(100))
-    output = capsys.readouterr().out
+    output = "".join(capsys.readouterr())  # the command line sends it to the standard error
     assert "(VALUE) learning V" in output
     assert "(FIT) learning cost+model" in output
     quick().fit(lq_plant.random_log(100), show_progress=False)
-    assert capsys.readouterr().out == ""
+    assert "".join(capsys.readouterr()) == ""
 
 
 def test_a_given_value_function_is_used_as_it_is() -> None:
