@@ -18,25 +18,13 @@ from mpcoffline.plotting import (
     new_figure,
     paper_style,
 )
+from mpcoffline.plotting.panels import TASKS
 
 from .results import REFERENCE, TaskResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# (label, state coordinate, whether it is a wrapping angle, half-width of the success band) of the panels of a task.
-_STATES: dict[str, tuple[tuple[str, int, bool, float | None], ...]] = {
-    "linear": (("$x$ (m)", 0, False, 0.05), ("$y$ (m)", 1, False, 0.05)),
-    "pendulum": (("angle $\\varphi$ (rad)", 0, True, 0.3), ("speed $\\dot\\varphi$ (rad/s)", 1, False, None)),
-    "cartpole": (("angle $\\varphi$ (rad)", 2, True, 0.3), ("position $x$ (m)", 0, False, None)),
-}
-_ACTIONS: dict[str, tuple[str, ...]] = {
-    "linear": ("force $F_x$ (N)", "force $F_y$ (N)"),
-    "pendulum": ("torque $u$ (N m)",),
-    "cartpole": ("force $u$ (N)",),
-}
-# Seconds that are shown where a task has settled long before the end of the episode.
-_SECONDS = {"linear": 5.0}
 SHOWN = ("MPC_1", "MPC_2", "MPC_3")
 
 
@@ -59,7 +47,7 @@ def main_job_figure(result: TaskResult) -> Figure:
         left.align_ylabels()
         panels[-1].set_xlabel("time (s)")
         length = result.dt * (len(signals[0].values[SHOWN[0]]) - 1)
-        panels[-1].set_xlim(0.0, min(length, _SECONDS.get(result.task, length)))
+        panels[-1].set_xlim(0.0, min(length, TASKS[result.env_id].seconds or length))
         handles, labels = legend_handles(SHOWN)
         left.legend(handles, labels, loc="outside upper center", ncols=3, handlelength=3.2)
         bars = right.subplots()
@@ -73,10 +61,10 @@ def _signals(result: TaskResult) -> list[Signal]:
     states, actions = ({name: _example(result, name)[i] for name in SHOWN} for i in (0, 1))
     space = gym.make(result.env_id).action_space
     signals = [
-        Signal(label, {name: s[:, i] for name, s in states.items()}, target=0.0, angle=angle, band=band)
-        for label, i, angle, band in _STATES[result.task]
+        Signal(c.label, {name: s[:, c.index] for name, s in states.items()}, target=0.0, angle=c.angle, band=c.band)
+        for c in TASKS[result.env_id].states
     ]
-    for i, label in enumerate(_ACTIONS[result.task]):
+    for i, label in enumerate(TASKS[result.env_id].actions):
         bounds = (float(space.low[i]), float(space.high[i])) if isinstance(space, spaces.Box) else None
         signals.append(Signal(label, {name: a[:, i] for name, a in actions.items()}, bounds=bounds, held=True))
     return signals
