@@ -1,0 +1,90 @@
+"""Configuration of the documentation site; scripts/docs builds and checks it."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import shutil
+import tempfile
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+
+project = "mpcoffline"
+author = "The mpcoffline developers"
+copyright = "2026, the mpcoffline developers"
+release = version = installed_version("mpcoffline")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+exclude_patterns = ["**/make_*.py"]
+
+# --- Text -----------------------------------------------------------------------------------------------------------
+
+myst_enable_extensions = ["amsmath", "attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+suppress_warnings = ["mystnb.unknown_mime_type"]
+copybutton_exclude = ".linenos, .gp, .go"
+
+# --- Docstrings -----------------------------------------------------------------------------------------------------
+
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+autodoc_typehints = "description"
+autodoc_typehints_format = "short"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+
+# --- Notebooks ------------------------------------------------------------------------------------------------------
+
+
+# Executed once for each state of the package: a notebook's outputs depend on it, which the cache's keys do not know.
+def _package_fingerprint() -> str:
+    files = sorted(p for folder in ("mpcoffline", "envs", "datasets") for p in (ROOT / folder).rglob("*"))
+    digest = hashlib.sha256()
+    for file in files:
+        if file.is_file() and file.suffix in {".py", ".c", ".h", ".toml", ".h5"}:
+            digest.update(str(file.relative_to(ROOT)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(ROOT / "build" / "notebooks" / _package_fingerprint())
+nb_execution_timeout = 120
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
+nb_merge_streams = True
+
+# What the notebooks' processes inherit: one thread, and a store of data sets that is not the user's.
+os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1", MPLBACKEND="agg", SDL_VIDEODRIVER="dummy")
+os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp(prefix="mpcoffline-docs-")
+
+# --- Pages ----------------------------------------------------------------------------------------------------------
+
+html_theme = "furo"
+html_title = "mpcoffline"
+html_static_path = ["_static"]
+html_css_files = ["custom.css"]
+html_copy_source = False
+html_show_sphinx = False
+
+# MathJax from its installed package: pages load nothing from the network.
+_MATHJAX = Path(importlib.util.find_spec("mathjax").submodule_search_locations[0]) / "static" / "mathjax" / "es5"
+_STAGED = ROOT / "build" / "static"
+for _name in ("tex-chtml-full.js", "output/chtml/fonts/woff-v2"):
+    _source, _target = _MATHJAX / _name, _STAGED / "mathjax" / _name
+    if not _target.exists():
+        _target.parent.mkdir(parents=True, exist_ok=True)
+        (shutil.copytree if _source.is_dir() else shutil.copy)(_source, _target)
+html_static_path.append(str(_STAGED))
+mathjax_path = "mathjax/tex-chtml-full.js"
