@@ -83,6 +83,8 @@ def test_bars_carry_their_values_and_fit_the_frame(axes: Axes) -> None:
 def test_labels() -> None:
     assert plotting.controller_label("MPC_12") == "MPC$_{12}$"
     assert plotting.controller_label("reference") == "reference"
+    assert plotting.controller_label("td3_bc_run") == "td3_bc_run"
+    assert plotting.controller_label("a$b$c") == r"a\$b\$c"
     handles, labels = plotting.legend_handles(["MPC_1", "someone else"])
     assert len(handles) == 2
     assert labels == ["MPC$_{1}$", "someone else"]

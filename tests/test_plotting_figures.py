@@ -51,8 +51,17 @@ def test_the_cost_figure_prints_the_weights_and_shares_its_shades() -> None:
     figure = plotting.cost_figure(nominal, learned, PENDULUM)
     texts = [text.get_text() for text in figure.axes[2].texts]
     assert texts == ["2.50", "0", "0", "0", "0", "0.25", "0", "0", "0", "0", "0.10", "0", "0", "0", "0", "0.10"]
-    shades = [axes.collections[0] for axes in (figure.axes[1], figure.axes[3])]
-    assert shades[0].get_clim() == shades[1].get_clim()
+
+
+@pytest.mark.parametrize("constant", [0.0, 7.0, -3.0])
+def test_one_colour_bar_holds_for_both_costs(constant: float) -> None:
+    """Also where learning has moved the whole cost: the same number has the same colour in both landscapes."""
+    nominal = nominal_mpc(PENDULUM)
+    learned = nominal.with_theta(nominal.space.pack({"stage_cost.constant": constant}))
+    figure = plotting.cost_figure(nominal, learned, PENDULUM)
+    first, second = (axes.collections[0] for axes in (figure.axes[1], figure.axes[3]))
+    np.testing.assert_array_equal(first.levels, second.levels)
+    assert first.levels[0] <= min(0.0, constant)
 
 
 def test_the_plane_of_the_pendulum_holds_its_cost() -> None:
@@ -163,6 +172,13 @@ class TestFilms:
             pytest.skip("no ffmpeg")
         film = plotting.animate(policies, PENDULUM, [np.pi, 0.0], tmp_path / "film.mp4", seconds=0.2, width=100)
         assert film.read_bytes()[4:8] == b"ftyp"
+
+    @pytest.mark.parametrize("number", [{"fps": 0}, {"width": 0}, {"seconds": -1.0}])
+    def test_numbers_that_make_no_film(
+        self, policies: dict[str, MPCPolicy], number: dict[str, float], tmp_path: Path
+    ) -> None:
+        with pytest.raises(InvalidArgumentError, match=f"{next(iter(number))}: expected a positive number"):
+            plotting.animate(policies, PENDULUM, [np.pi, 0.0], tmp_path / "film.gif", **number)  # type: ignore[arg-type]
 
     def test_nobody_to_film(self, tmp_path: Path) -> None:
         pytest.importorskip("pygame")

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 
 from .panels import task_of
-from .style import OTHER, STYLES, write_whole
+from .style import OTHER, STYLES, stem_and_index, write_whole
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -59,13 +59,17 @@ def animate(
         The file.
 
     Raises:
-        InvalidArgumentError: For another suffix, no controllers, or an environment that is none of this package's.
+        InvalidArgumentError: For another suffix, no controllers, a number that is not positive, or an environment that
+            is none of this package's.
         MPCOfflineError: If pygame, or for MP4 ffmpeg, is missing.
     """
     target = Path(path)
     check_film(target)
     if not policies:
         raise InvalidArgumentError("policies", expected="at least one", actual="none")
+    for name, number in (("seconds", 1.0 if seconds is None else seconds), ("fps", fps), ("width", width)):
+        if not number > 0:
+            raise InvalidArgumentError(name, expected="a positive number", actual=str(number))
     task, _ = task_of(env)
     every = max(1, round(1.0 / (fps * task.dt)))
     columns = [_frames(policy, env, start, seconds, every) for policy in policies.values()]
@@ -136,7 +140,7 @@ def _beside(names: list[str], moment: tuple[NDArray[np.uint8], ...], width: int)
 
 def _title(name: str) -> str:
     """The name of a controller with its index lowered, as in the figures."""
-    stem, _, index = name.partition("_")
+    stem, index = stem_and_index(name)
     return stem + index.translate(_LOWERED)
 
 

@@ -57,14 +57,15 @@ def cost_figure(
             )
     weights = [stage_weights(mpc) for mpc in mpcs]
     landscapes = [on_plane(task, labels, partial(_stage_cost, mpc)) for mpc in mpcs]
-    top = max(float(values.max()) for _, _, values in landscapes)
+    everything = np.stack([values for _, _, values in landscapes])
+    span = float(everything.min()), float(everything.max())  # one colour bar for both
     with paper_style():
         figure = new_figure(PAGE_WIDTH, 4.6)
         panels = np.asarray(figure.subplots(2, 2, width_ratios=(1.0, 1.25)))
         for (left, right), name, weight, landscape in zip(panels, names, weights, landscapes, strict=True):
             draw_weights(left, weight, _entries(labels))
             left.set_title(f"weights of {controller_label(name)}")
-            shades = draw_levels(right, landscape, top)
+            shades = draw_levels(right, landscape, span)
             right.set_title(f"stage cost of {controller_label(name)}, no input")
             label_plane(right, labels)
         figure.colorbar(shades, ax=panels[:, 1], pad=0.02, aspect=40, label="$\\hat L$")

@@ -64,13 +64,13 @@ def phase_portrait(
     return figure
 
 
-def draw_levels(axes: Axes, landscape: Landscape, top: float | None = None) -> Any:
+def draw_levels(axes: Axes, landscape: Landscape, span: tuple[float, float] | None = None) -> Any:
     """Shades and lines of equal values; dark is small, so that it reads the same in grey.
 
     Args:
         axes: Where.
         landscape: What.
-        top: Where the shades end; near the largest value by default.
+        span: Where the shades begin and end; from the smallest to near the largest value by default.
 
     Returns:
         The shades, for a colour bar.
@@ -78,7 +78,7 @@ def draw_levels(axes: Axes, landscape: Landscape, top: float | None = None) -> A
     from matplotlib.ticker import MaxNLocator
 
     horizontal, vertical, values = landscape
-    low, high = float(values.min()), float(np.percentile(values, _EXTREME)) if top is None else top
+    low, high = (float(values.min()), float(np.percentile(values, _EXTREME))) if span is None else span
     levels = MaxNLocator(_LEVELS).tick_values(low, max(high, low + 1e-9))
     extend = "max" if values.max() > levels[-1] else "neither"
     shades = axes.contourf(horizontal, vertical, values, levels, cmap="cividis", extend=extend)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 COLUMN_WIDTH = 3.5
 PAGE_WIDTH = 7.16
 _PNG_DPI = 200
+_INDEXED = re.compile(r"([A-Za-z]+)_(\d+)")
 
 
 @dataclass(frozen=True)
@@ -129,10 +131,16 @@ def write_whole(path: Path, content: bytes) -> Path:
     return path
 
 
+def stem_and_index(name: str) -> tuple[str, str]:
+    """The parts of a controller's name, ``("MPC", "1")`` of ``MPC_1``; another name has no index."""
+    parts = _INDEXED.fullmatch(name)
+    return (parts[1], parts[2]) if parts else (name, "")
+
+
 def controller_label(name: str) -> str:
-    """The name of a controller as it is set in a figure: ``MPC_1`` with its index lowered."""
-    stem, _, index = name.partition("_")
-    return f"{stem}$_{{{index}}}$" if index else stem
+    """The name of a controller as it is set in a figure: ``MPC_1`` with its index lowered, others as they are."""
+    stem, index = stem_and_index(name)
+    return stem.replace("$", r"\$") + (f"$_{{{index}}}$" if index else "")
 
 
 def legend_handles(names: Sequence[str]) -> tuple[list[Any], list[str]]:
