@@ -12,6 +12,7 @@ from rich.table import Table
 
 from mpcoffline.cli_common import (
     Alpha,
+    PlantAlpha,
     Preset,
     Seed,
     TaskArgument,
@@ -87,9 +88,7 @@ def run(
 )
 def collect(
     task: TaskArgument,
-    alpha: Annotated[
-        float | None, typer.Option(help="Plant of the linear task.", show_default="1.0", min=0.0, max=4.0)
-    ] = None,
+    alpha: PlantAlpha = None,
     steps: Annotated[int | None, typer.Option(help="Transitions.", show_default="50000", min=1)] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of agent and environment.", show_default="0", min=0)] = None,
     dataset_id: Annotated[
