@@ -197,6 +197,15 @@ def made_environment(env_id: str, alpha: float | None, start: Start | None) -> E
     return env
 
 
+def check_figure(option: str, path: Path) -> None:
+    """Refuses a file that Matplotlib cannot write: before the work, not after it."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix.lstrip(".").lower() not in known:
+        raise InvalidArgumentError(option, expected=f"a file ending in .{', .'.join(sorted(known))}", actual=str(path))
+
+
 def check_folder_of(option: str, path: Path) -> None:
     """Refuses a file whose folder is missing: before the work, not after it."""
     if not path.parent.is_dir():

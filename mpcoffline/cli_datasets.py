@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from mpcoffline.cli_common import Json, console, examples, print_json, say
+from mpcoffline.cli_common import Json, check_figure, console, examples, print_json, say
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="The data sets on this machine.")
 
@@ -54,6 +54,8 @@ def show(
     """The card and the statistics of a data set."""
     from mpcoffline.datasets import show as summarise
 
+    if figure is not None:
+        check_figure("--figure", figure)
     summary = summarise(dataset_id, figure)
     if as_json:
         print_json(asdict(summary))

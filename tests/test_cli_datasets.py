@@ -33,6 +33,14 @@ def test_show_prints_the_card_and_draws_the_coverage(tmp_path: Path) -> None:
     assert (tmp_path / "coverage.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("name", ["coverage", "coverage.xyz"])
+def test_show_refuses_a_figure_that_cannot_be_written(name: str, tmp_path: Path) -> None:
+    code, output = run("show", SHIPPED, "--figure", str(tmp_path / name))
+    assert code == 1
+    assert "--figure: expected a file ending in" in output
+    assert ".png" in output
+
+
 @pytest.mark.slow
 def test_verify_replay_and_repair_of_intact_data() -> None:
     assert run("verify", SHIPPED)[0] == 0

@@ -113,6 +113,13 @@ def test_training_curves_start_fit_at_the_error_before_learning() -> None:
     assert fit.get_title().endswith(", 0.4 to 0.1")
 
 
+def test_losses_read_as_numbers() -> None:
+    axes = plotting.training_figure(made_up_learner([40.0, 2.0, 0.01])).axes[0]
+    low, high = axes.get_ylim()
+    labels = [t.get_text() for t, y in zip(axes.get_yticklabels(), axes.get_yticks(), strict=True) if low < y < high]
+    assert {"0.01", "1", "10"} <= set(labels)
+
+
 def test_what_cannot_be_drawn_is_refused() -> None:
     nominal = nominal_mpc(PENDULUM)
     with pytest.raises(MPCOfflineError, match="expected a fitted learner"):

@@ -59,7 +59,7 @@ def _draw_curve(axes: Axes, epochs: Array, values: Array) -> None:
     if values.min() > 0.0 and values.max() > _DECADE * values.min():
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:.0e}".replace("e-0", "e-")))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}".replace("e-0", "e-")))
         axes.yaxis.set_minor_locator(NullLocator())
     elif values.min() >= 0.0:
         axes.set_ylim(0.0, 1.15 * float(values.max()))
