@@ -309,8 +309,9 @@ def check_contract() -> None:
     """The boxes stand as the layers of import-linter's contract, and learning may not import solvers."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
     layers = next(c["layers"] for c in contracts if c["type"] == "layers")
-    home = {f"mpcoffline.{module}": box for box, modules in MODULES.items() for module in modules}
-    rows = [[BOXES[home[m]].y for m in re.findall(r"[\w.]+", layer)] for layer in layers]
+    home = {module: box for box, modules in MODULES.items() for module in modules}
+    names = [[name.removeprefix("mpcoffline.") for name in re.findall(r"[\w.]+", layer)] for layer in layers]
+    rows = [[BOXES[home[name]].y for name in layer] for layer in names]
     for i, (above, below) in enumerate(pairwise(rows)):
         if max(below) < min(above):
             raise SystemExit(f"the boxes of {layers[i + 1]!r} stand above those of {layers[i]!r}")
