@@ -51,12 +51,12 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     A task states its plant and its cost as four functions of arrays with any leading dimensions
     (:meth:`next_state`, :meth:`cost`, :meth:`observe`, :meth:`is_success`), how an episode starts
     (:meth:`sample_state`) and what it looks like (:meth:`draw`); this class turns them into a Gymnasium environment.
-    A task sets its spaces and :attr:`state_limit` before it calls this class's ``__init__``.
+    A task sets its spaces and ``state_limit`` before it calls this class's ``__init__``.
 
     The simulation runs in float64. Every ``info`` carries ``"cost"`` (the cost L(s_k, a_k) of the step just taken as
     float64; 0 at reset), ``"state"`` (the state s reached, float64) and ``"is_success"``. A task never
     terminates: the time limit truncates it, so that a learner bootstraps from the last observation. A state that would
-    leave :attr:`state_limit` (no episode of 100 steps of the default plant does) stays at the limit, so that
+    leave ``state_limit`` (no episode of 100 steps of the default plant does) stays at the limit, so that
     observations keep their bounds in episodes of any length.
 
     **Noise**, both Gaussian, independent between steps and coordinates, off by default::
@@ -71,11 +71,11 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     spawned from ``np_random`` by ``reset(seed=...)``: the same seed gives the same starts with and without noise.
 
     ``reset(options=...)`` knows ``{"state": s}`` (start there), ``{"start": name}`` with a name out of
-    :attr:`starts`, and ``{"low": l, "high": h}`` (uniform between them; scalars or ``(nx,)``; an angle's bounds may
+    ``starts``, and ``{"low": l, "high": h}`` (uniform between them; scalars or ``(nx,)``; an angle's bounds may
     reach to 2 pi, the draw is wrapped).
 
     Args:
-        start: Distribution of initial states when ``reset`` is not told otherwise: a name out of :attr:`starts`
+        start: Distribution of initial states when ``reset`` is not told otherwise: a name out of ``starts``
             (the first by default) or bounds ``(low, high)`` as above.
         process_noise: Standard deviation of w, a scalar or one a coordinate of s.
         measurement_noise: Standard deviation of v, a scalar or one a coordinate of s.
@@ -154,7 +154,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         return bool(self.process_noise.any() or self.measurement_noise.any())
 
     def confined(self, state: Array) -> Array:
-        """The state ``(..., nx)`` within :attr:`state_limit`, its angle wrapped to (-pi, pi]."""
+        """The state ``(..., nx)`` within ``state_limit``, its angle wrapped to (-pi, pi]."""
         inside = np.minimum(np.maximum(state, -self.state_limit), self.state_limit)
         if self.angle is not None:
             inside[..., self.angle] = wrap_angle(inside[..., self.angle])

@@ -1,4 +1,4 @@
-"""The commands ``mpcoffline run`` and ``mpcoffline collect``."""
+"""The commands ``mpcoffline run``, ``mpcoffline reproduce`` and ``mpcoffline collect``."""
 
 from __future__ import annotations
 
@@ -78,6 +78,29 @@ def run(
         console.print(f"  {escape(note)}", highlight=False, style="dim")
     for what, name in (("Table", "results.md"), ("Figure", "figure.png"), ("Controllers", "controllers")):
         say_file(what, folder / name)
+
+
+@app.command(
+    epilog=examples("mpcoffline reproduce", "mpcoffline reproduce --alpha 1.5 --seed 3 --output results/paper-15")
+)
+def reproduce(
+    alpha: Alpha = 1.0,
+    seed: Seed = 0,
+    episodes: Annotated[int, typer.Option(help="Closed-loop episodes of each controller.", min=1)] = 24,
+    output: Annotated[Path, typer.Option(help="Folder for tables and figures.", file_okay=False)] = (
+        Path("results/paper")
+    ),
+) -> None:
+    """The paper's study: the main job for all three tasks, by the published recipe, on one page.
+
+    Takes some minutes. What is done is kept: the same command again goes on where it was interrupted.
+    """
+    from mpcoffline.study import reproduce as reproduce_study
+
+    for result in reproduce_study(output, alpha=alpha, seed=seed, n_episodes=episodes):
+        console.print(result.table())
+        say_file("Figure", output / result.task / "figure.png")
+    say_file("All of it", output / "results.md")
 
 
 @app.command(

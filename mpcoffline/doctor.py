@@ -11,24 +11,13 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 Status = Literal["ok", "warn", "fail"]
 
-_NEEDED = (
-    "gymnasium",
-    "stable-baselines3",
-    "torch",
-    "casadi",
-    "daqp",
-    "h5py",
-    "minari",
-    "numpy",
-    "scipy",
-    "matplotlib",
-    "typer",
-    "rich",
-)
 #: Optional packages, and what they are for.
 _OPTIONAL = {
     "pygame": ("pictures and films of the environments", "render"),
@@ -90,10 +79,12 @@ def _versions() -> Iterator[Check]:
     yield Check("mpcoffline", "ok", f"{__version__} in {Path(__file__).parent}")
     yield Check("Python", "ok", f"{platform.python_version()} ({sys.executable})")
     yield Check("platform", "ok", platform.platform())
-    for name in _NEEDED:
-        version = _version(name)
+    for requirement in _needed():
+        name, wanted, version = requirement.name, requirement.specifier, _version(requirement.name)
         if version is None:
             yield Check(name, "fail", "not installed", _REINSTALL)
+        elif not wanted.contains(version, prereleases=True):
+            yield Check(name, "fail", f"{version}, where {wanted} is needed", _REINSTALL)
         else:
             yield Check(name, "ok", version)
 
@@ -185,6 +176,14 @@ def _hardware() -> Iterator[Check]:
 
 
 _EXAMINATIONS = (_versions, _optional_packages, _compiler, _solvers, _data_sets, _hardware)
+
+
+def _needed() -> list[Requirement]:
+    """What the package's own metadata ask for, extras apart."""
+    from packaging.requirements import Requirement  # comes with Matplotlib
+
+    given = [Requirement(text) for text in importlib.metadata.requires("mpcoffline") or ()]
+    return [each for each in given if each.marker is None or each.marker.evaluate({"extra": ""})]
 
 
 def _version(name: str) -> str | None:

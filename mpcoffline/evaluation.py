@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class Predictor(Protocol):
-    """Anything with SB3's ``predict``: an :class:`MPCPolicy`, an SB3 algorithm or policy."""
+    """Anything with SB3's ``predict``: an :class:`mpcoffline.MPCPolicy`, an SB3 algorithm or policy."""
 
     def predict(
         self,

@@ -46,7 +46,7 @@ class MPCPolicy(BasePolicy):
     ``predict`` solves one MPC an observation. The warm start travels in SB3's recurrent ``state``, so that nothing is
     hidden in the policy: ``state=None`` is a cold, deterministic solve. A solve that fails does not raise in the
     control loop: the policy applies the next input of the previous plan (or zero, within bounds), counts it in
-    :attr:`solver_stats`, and logs a warning the first time.
+    ``solver_stats``, and logs a warning the first time.
 
     The policy is also a plain function, ``policy(observations)``: actions alone, by cold solves.
 

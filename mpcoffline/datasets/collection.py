@@ -45,7 +45,7 @@ def collect(
     """Trains the task's agent by its recipe and records every transition.
 
     What is recorded is raw (y, u in its units, reward -L, float64 cost and state), although the agent
-    sees scaled observations and a scaled reward. :func:`return_curve` gives the return of each episode.
+    sees scaled observations and a scaled reward. ``return_curve`` gives the return of each episode.
 
     Args:
         task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.

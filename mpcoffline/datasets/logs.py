@@ -41,7 +41,7 @@ def record(
     algorithm_name: str | None = None,
     description: str | None = None,
 ) -> MinariDataset:
-    """Runs a policy and records what happens, as safely as :class:`MinariRecorder`.
+    """Runs a policy and records what happens, as safely as :class:`mpcoffline.MinariRecorder`.
 
     A recording that was interrupted goes on with the episode after the last one finished; with a seed the result is the
     same as without the interruption.

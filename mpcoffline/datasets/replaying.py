@@ -56,7 +56,7 @@ class ReplayReport:
         env_id: Gymnasium id of the environment.
         episodes: Number of episodes simulated.
         steps: Number of steps simulated.
-        free_run: Largest deviation of each of :data:`QUANTITIES` over whole episodes: errors pile up along it, and a
+        free_run: Largest deviation of each of ``QUANTITIES`` over whole episodes: errors pile up along it, and a
             chaotic or unstable plant makes much of the last bit.
         one_step: The same, each step from the recorded state; empty for an environment that is no
             :class:`~mpcoffline.envs.ControlTask`.
@@ -150,7 +150,7 @@ def replay(
         dataset: The data set or its id; ``infos/state`` must be recorded.
         n_episodes: How many, spread evenly over the data set; None for all.
         allow_import: Whether an environment that is not registered may be imported from where the data set says.
-        tolerances: Largest allowed deviation by name in :data:`QUANTITIES`, in place of :data:`TOLERANCES`.
+        tolerances: Largest allowed deviation by name in ``QUANTITIES``, in place of ``TOLERANCES``.
         progress: Whether to show a progress bar.
 
     Raises:

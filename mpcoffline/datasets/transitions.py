@@ -290,8 +290,8 @@ class TransitionTable:
     def trim(self, fraction: float) -> TransitionTable:
         """Drops the transitions farthest out, on which a value regression would spend itself.
 
-        Keeps the ``fraction`` of rows with the smallest max(|s / med|, |s+ / med|) over all coordinates, with
-        med the median of |s| per coordinate (where that is zero its mean, where that is zero too, 1).
+        Keeps the ``fraction`` of rows with the smallest ``max(|s / med|, |s+ / med|)`` over all coordinates, with
+        med the median of ``|s|`` per coordinate (where that is zero its mean, where that is zero too, 1).
 
         Args:
             fraction: Share of rows to keep, in (0, 1].

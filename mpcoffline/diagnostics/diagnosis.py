@@ -60,7 +60,7 @@ def diagnose(
     Both controllers, MPC_1 and the learned one, are simulated on an ensemble of models identified from the log (see
     :class:`~mpcoffline.diagnostics.ensemble.Ensemble`), from initial states of the log, with a stage cost learned from
     the logged costs (:class:`~mpcoffline.diagnostics.logged_cost.LoggedCost`). That decides the verdict
-    (:func:`~mpcoffline.diagnostics.verdict.decide`); all else is reported beside it.
+    (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
 
     Example:
         >>> report = mpcoffline.diagnose(learner, "mpcoffline/pendulum/ddpg-v0")

@@ -35,7 +35,7 @@ class FitConfig:
     """How theta is learned.
 
     Attributes:
-        prior: l2, the weight of |z - z_0|^2, where z are the scaled coordinates of
+        prior: l2, the weight of ``|z - z_0|^2``, where z are the scaled coordinates of
             :class:`~mpcoffline.learning.coordinates.Coordinates` and the regression error is measured in units of the
             cost's variance.
         prediction_weight: Weight of the one-step prediction error

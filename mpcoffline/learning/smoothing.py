@@ -141,7 +141,7 @@ def smooth(
 ) -> TransitionTable:
     """The table with its states smoothed: their estimates given all measurements of their episode and the model.
 
-    An extended Rauch-Tung-Striebel smoother, see :mod:`mpcoffline.learning.kalman`. The process noise decides whom it
+    An extended Rauch-Tung-Striebel smoother, see ``mpcoffline.learning.kalman``. The process noise decides whom it
     believes: with a model of the wrong structure it stays close to the data.
 
     Args:

@@ -20,7 +20,7 @@ class ValueConfig:
     Attributes:
         method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, ``"iql"`` for noisy plants, or
             ``"auto"``: ``"iql"`` where the data are noisy
-            (:func:`~mpcoffline.learning.value_noise.estimate_stochasticity`), else ``"expectile"``.
+            (:func:`~mpcoffline.learning.estimate_stochasticity`), else ``"expectile"``.
         tau: The expectile, for ``"expectile"`` and ``"iql"``.
         n_steps: Gradient steps.
         batch_size: Transitions a step.

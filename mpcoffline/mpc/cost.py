@@ -92,7 +92,7 @@ class QuadraticCost(Component):
         return scipy.linalg.block_diag(values["W"], values["R"]) if "R" in values else values["W"]
 
     def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
-        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that e'We = |C'e|^2."""
+        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that ``e'We = |C'e|^2``."""
         e = self._error(x, p)
         if "H" in p:
             return ca.sumsqr(p["H"].T @ ca.vertcat(e, difference("u", u, p["u_ref"]))) + p["constant"]
@@ -113,7 +113,7 @@ class QuadraticCost(Component):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """The inverse of :meth:`to_json`."""
+        """The inverse of ``to_json``."""
         cost = cls.__new__(cls)
         cost.space = blocks_from_json(data)
         values = cost.values
@@ -158,7 +158,7 @@ class NormCost(Component):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> NormCost:
-        """The inverse of :meth:`to_json`."""
+        """The inverse of ``to_json``."""
         cost = cls(np.zeros(1), float(data["eps"]))
         cost.space = blocks_from_json(data)
         cost.nx = len(cost.values["x_ref"])

@@ -78,7 +78,8 @@ class LiftedCost(QuadraticCost):
 
         Args:
             cost: The cost.
-            features: Features of which the first nx are the state itself, e.g. :func:`polynomial_features`.
+            features: Features of which the first nx are the state itself, e.g. of
+                :func:`mpcoffline.mpc.polynomial_features`.
 
         Raises:
             InvalidArgumentError: If they are not.
@@ -104,7 +105,7 @@ class LiftedCost(QuadraticCost):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """The inverse of :meth:`to_json`."""
+        """The inverse of ``to_json``."""
         cost = super().from_json(data)
         cost.features = function_from_json(data["features"], "features", inputs=(cost.nx,), output=len(cost.W))
         return cost

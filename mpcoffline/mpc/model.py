@@ -119,7 +119,7 @@ class Model(Component):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Model:
-        """The inverse of :meth:`to_json`.
+        """The inverse of ``to_json``.
 
         Raises:
             FileFormatError: If the function is damaged or of other shapes.

@@ -29,7 +29,7 @@ class NetworkCost(Component):
         net(z) = A_n h_n + b_n,    h_{k+1} = sigma(A_k h_k + b_k),    h_0 = z,    sigma(a) = a / sqrt(1 + a^2)
 
     By Theorem 1 of Gros & Zanon (doi:10.1109/TAC.2019.2913768) the terminal cost of a learned MPC should be the value
-    function. :func:`mpcoffline.learning.terminal.fit_terminal` distils one into this form, which is small enough for
+    function. :func:`mpcoffline.learning.fit_terminal` distils one into this form, which is small enough for
     the inner loop of a solver. The network is bounded: W decides how the cost grows far away from the data.
 
     All numbers are parameters; those of the normalisation and the reference belong to the group ``"reference"``.
@@ -83,7 +83,7 @@ class NetworkCost(Component):
 
     @classmethod
     def random(cls, nx: int, hidden: Sequence[int] = HIDDEN, *, seed: int, **options: Any) -> NetworkCost:
-        """A cost with random weights; see :func:`random_layers`.
+        """A cost with random weights; see ``random_layers``.
 
         Args:
             nx: Number of states.
@@ -105,7 +105,7 @@ class NetworkCost(Component):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """The inverse of :meth:`to_json`."""
+        """The inverse of ``to_json``."""
         cost = cls.__new__(cls)
         cost.space = blocks_from_json(data)
         cost.nx, cost.n_layers = len(cost.values["mean"]), _n_layers(cost.values, "weights")
@@ -215,7 +215,7 @@ class ConvexNetworkCost(QuadraticCost):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """The inverse of :meth:`to_json`."""
+        """The inverse of ``to_json``."""
         cost = super().from_json(data)
         cost.n_layers = _n_layers(cost.values, "passes")
         return cost

@@ -167,7 +167,7 @@ class Block:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Block:
-        """The inverse of :meth:`to_json`.
+        """The inverse of ``to_json``.
 
         Raises:
             FileFormatError: If sizes or kinds do not belong together, or coordinates are out of bounds.

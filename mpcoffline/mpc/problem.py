@@ -234,7 +234,7 @@ class MPC:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> MPC:
-        """The inverse of :meth:`to_json`.
+        """The inverse of ``to_json``.
 
         Raises:
             FileFormatError: If something is missing or damaged.

@@ -95,9 +95,9 @@ class Solver(ABC):
 
     Attributes:
         mpc: The problem.
-        name: What :func:`make_solver` calls it.
+        name: What :func:`mpcoffline.make_solver` calls it.
         theta_dimensions: Which forms of theta it takes: 1 ``(size,)``, 2 ``(B, size)``, 3 ``(B, N + 1, size)``.
-        reason: Why :func:`make_solver` chose it; empty where it was named.
+        reason: Why :func:`mpcoffline.make_solver` chose it; empty where it was named.
     """
 
     name: str
@@ -121,7 +121,7 @@ class Solver(ABC):
             x: Initial states, ``(B, nx)`` or ``(nx,)``.
             theta: Parameters, ``(size,)``; the MPC's own by default. Solvers whose ``theta_dimensions`` say so also
                 take one theta a problem, ``(B, size)``, and one a problem and stage, ``(B, N + 1, size)`` or
-                ``(1, N + 1, size)``: time-varying references, prices, models, see :meth:`MPC.theta_along`.
+                ``(1, N + 1, size)``: time-varying references, prices, models, see :meth:`mpcoffline.MPC.theta_along`.
             u0: First inputs that are imposed, ``(B, nu)`` or ``(nu,)``.
             warm_start: A plan near the solution (an earlier solution, shifted); rows of NaN start cold.
 

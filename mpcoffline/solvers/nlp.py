@@ -102,7 +102,7 @@ class IpoptSolver(Solver):
         return Solution(u[:, 0].copy(), trajectories, u, values, success, [one.status for one in found], stats)
 
     def solve_each(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
-        """Solves the problems one after the other in this process; arguments as checked by :meth:`solve`."""
+        """Solves the problems one after the other in this process; arguments as checked by ``solve``."""
         program = self._stagewise if theta.ndim == 3 else self._common
         known = warm_start.known
         return [

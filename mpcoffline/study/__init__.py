@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .main_job import run_task
+from .reproduction import reproduce
 from .results import ControllerResult, TaskResult
 
-__all__ = ["ControllerResult", "TaskResult", "run_task"]
+__all__ = ["ControllerResult", "TaskResult", "reproduce", "run_task"]

@@ -19,8 +19,7 @@ from mpcoffline.errors import MPCOfflineError
 logger = logging.getLogger(__name__)
 
 # -ffast-math would set flush-to-zero for the whole process and drop the NaN checks; these do neither. A model's
-# derivatives divide by the same few numbers again and again: -freciprocal-math divides once and multiplies; and they
-# are long straight lines of code, which scheduling by register pressure makes 15 % faster.
+# derivatives are long straight lines of code, which scheduling by register pressure makes 15 % faster.
 FLAGS = (
     "-std=gnu11",
     "-O3",
@@ -28,7 +27,6 @@ FLAGS = (
     "-shared",
     "-fno-math-errno",
     "-fno-trapping-math",
-    "-freciprocal-math",
     "-fschedule-insns",
     "-fsched-pressure",
     "-march=native",

@@ -13,12 +13,13 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.expressions import Instruction, expanded, instructions
 from mpcoffline.solvers.linear_quadratic import promises_convexity
 
-_INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
+from .elimination import value_and_jacobian
+
+_INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*"}
 _FORMATS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
     ca.OP_TWICE: "{0} + {0}",
-    ca.OP_INV: "1.0 / {0}",
     ca.OP_FABS: "vd_abs({0})",
     ca.OP_SIGN: "vd_bool({0} > 0.0) - vd_bool({0} < 0.0)",
     ca.OP_NOT: "vd_bool({0} == 0.0)",
@@ -72,10 +73,12 @@ def generated(mpc: MPC) -> str:
     x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
     following, gradient = ca.SX.sym("following", mpc.nx), ca.SX.sym("Vx", mpc.nx)
     curvature, discount = ca.SX.sym("Vxx", mpc.nx * (mpc.nx + 1) // 2), ca.SX.sym("discount")
+    z = ca.vertcat(x, u)
     reached, cost = mpc.dynamics_function(x, u, theta), mpc.stage_function(x, u, theta)
     final = mpc.terminal_function(x, theta)
     final_hessian, final_gradient = ca.hessian(final, x)
-    hessian, slope = ca.hessian(cost, ca.vertcat(x, u))
+    hessian, slope = ca.hessian(cost, z)
+    linearised = value_and_jacobian(reached, z, theta)
     inputs = {
         "gen_step": [x, u],
         "gen_final": [x],
@@ -92,7 +95,7 @@ def generated(mpc: MPC) -> str:
         stage = ca.SX.sym("stage", outputs["gen_stage_expand"].numel())
         inputs["gen_q"].append(stage)
         slope, hessian = stage[: mpc.nx + mpc.nu], _symmetric(stage[mpc.nx + mpc.nu :], mpc.nx + mpc.nu)
-    outputs["gen_q"] = _action_value(reached, slope, hessian, x, u, following, gradient, curvature, discount)
+    outputs["gen_q"] = _action_value(*linearised, slope, hessian, following, gradient, curvature, discount)
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
     convex = int(promises_convexity(mpc.stage_cost)), int(promises_convexity(mpc.terminal_cost))
@@ -107,10 +110,9 @@ def generated(mpc: MPC) -> str:
 
 def _action_value(
     reached: ca.SX,
+    jacobian: ca.SX,
     stage_gradient: ca.SX,
     stage_hessian: ca.SX,
-    x: ca.SX,
-    u: ca.SX,
     following: ca.SX,
     gradient: ca.SX,
     curvature: ca.SX,
@@ -118,19 +120,19 @@ def _action_value(
 ) -> ca.SX:
     """The quadratic model of Q(x, u) = L + gamma V(f(x, u)), V expanded at the successor that the trajectory names.
 
-    L's is given by its gradient and Hessian with respect to (x, u).
+    f is given by its value and Jacobian, L by its gradient and Hessian, all with respect to (x, u).
 
     Gauss-Newton: the curvature of f is left out. In the order that the kernel expects: the defect, Qx, Qu, Qxx (upper
     triangle), Qux, Quu.
     """
-    Vxx = _symmetric(curvature, x.numel())
-    fx, fu = ca.jacobian(reached, x), ca.jacobian(reached, u)
-    nx = x.numel()
+    nx = reached.numel()
+    discounted = _symmetric(discount * curvature, nx)
+    fx, fu = jacobian[:, :nx], jacobian[:, nx:]
     lx, lu = stage_gradient[:nx], stage_gradient[nx:]
     lxx, lux, luu = stage_hessian[:nx, :nx], stage_hessian[nx:, :nx], stage_hessian[nx:, nx:]
     defect = reached - following
-    slope = discount * (gradient + Vxx @ defect)
-    weighted_fx, weighted_fu = discount * (Vxx @ fx), discount * (Vxx @ fu)
+    slope = discount * gradient + discounted @ defect
+    weighted_fx, weighted_fu = discounted @ fx, discounted @ fu
     return _stacked(
         defect,
         lx + fx.T @ slope,
@@ -200,7 +202,10 @@ def _function(name: str, arguments: str, statements: list[str], unused: list[str
 
 
 def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
-    """One C statement an instruction; values that a later piece reads go through the array ``w`` of all pieces."""
+    """One C statement an instruction; values that a later piece reads go through the array ``w`` of all pieces.
+
+    Divisions multiply by reciprocals, as a model's derivatives divide by the same few numbers again and again.
+    """
     value_in: dict[int, int] = {}  # by place in the work vector: the instruction whose value is there
     read: list[dict[int, int]] = []  # of each instruction: the places that it reads, and whose values they are
     last_read: dict[int, int] = {}
@@ -210,8 +215,10 @@ def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
         if op != ca.OP_OUTPUT:
             value_in[targets[0]] = k
     statements = []
+    reciprocals: set[tuple[int, int]] = set()  # those that are known: piece, number of the divisor
     for k, (op, sources, targets, constant) in enumerate(program):
         start = k - k % piece
+        first = ""
         names = [
             f"v{read[k][place]}" if read[k][place] >= start else f"w[{place}]" for place in sources if place in read[k]
         ]
@@ -224,12 +231,18 @@ def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
             result = f"i{sources[0]}[{sources[1]}]"
         elif op in _INFIX:
             result = f"{names[0]} {_INFIX[op]} {names[1]}"
+        elif op in (ca.OP_DIV, ca.OP_INV):
+            divisor = read[k][sources[-1]]
+            if (start, divisor) not in reciprocals:
+                reciprocals.add((start, divisor))
+                first = f"const vd r{divisor} = 1.0 / {names[-1]}; "
+            result = " * ".join([*names[:-1], f"r{divisor}"])
         elif op in _FORMATS:
             result = _FORMATS[op].format(*names)
         else:
             raise InvalidArgumentError(name, expected="operations that C has", actual=f"CasADi operation {op}")
         kept = f" w[{targets[0]}] = v{k};" if last_read.get(k, k) >= start + piece else ""
-        statements.append(f"const vd v{k} = {result};{kept}")
+        statements.append(f"{first}const vd v{k} = {result};{kept}")
     return statements
 
 

@@ -76,8 +76,8 @@ class DDPSolver(Solver):
     Args:
         mpc: The problem; without constraints other than input bounds.
         max_iterations: Bound on the iterations of a problem.
-        tolerance: Predicted decrease of the cost, relative to 1 + |V|, below which a problem is solved; 1000 times as
-            much where the iterations are used up.
+        tolerance: Predicted decrease of the cost, relative to ``1 + |V|``, below which a problem is solved; 1000 times
+            as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
         n_threads: Threads that share a batch; a batch of up to eight problems uses one.
 
