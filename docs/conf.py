@@ -6,12 +6,14 @@ import hashlib
 import importlib.util
 import os
 import shutil
+import sys
 import tempfile
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
+sys.path.insert(0, str(DOCS / "_ext"))
 
 project = "mpcoffline"
 author = "The mpcoffline developers"
@@ -25,8 +27,17 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "sphinx_design",
+    "command_help",
+    "markdown_docstrings",
 ]
 exclude_patterns = ["**/make_*.py"]
+nitpicky = True
+# Types in signatures that have no page here: other libraries', and what our own return beside their results.
+nitpick_ignore_regex = [
+    ("py:class", r"(?!mpcoffline\.).*"),
+    ("py:class", r"mpcoffline\.\w+\.\w+\.\w+"),
+    ("py:exc", r"(?!mpcoffline\.).*"),
+]
 
 # --- Text -----------------------------------------------------------------------------------------------------------
 
@@ -38,7 +49,9 @@ copybutton_exclude = ".linenos, .gp, .go"
 # --- Docstrings -----------------------------------------------------------------------------------------------------
 
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True
 napoleon_use_rtype = False
+autodoc_type_aliases = {"ArrayLike": "ArrayLike", "NDArray": "NDArray"}  # as they are written, not expanded
 autodoc_typehints = "description"
 autodoc_typehints_format = "short"
 autodoc_typehints_description_target = "documented"
