@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import platform
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
 from typer.testing import CliRunner
 
 from mpcoffline import doctor
@@ -65,10 +67,24 @@ def test_a_compiler_that_fails_is_found_out(monkeypatch: pytest.MonkeyPatch, tmp
 
 def test_a_missing_needed_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     only(monkeypatch, "_versions")
-    monkeypatch.setattr(doctor, "_NEEDED", ("numpy", "a-package-that-nobody-has"))
+    needed = [Requirement("numpy"), Requirement("a-package-that-nobody-has")]
+    monkeypatch.setattr(doctor, "_needed", lambda: needed)
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == 1
     assert "fail  a-package-that-nobody-has: not installed -> Run: pip install" in result.stdout
+
+
+def test_what_is_needed_is_what_the_metadata_say() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
+    assert [each.name for each in doctor._needed()] == [Requirement(text).name for text in project["dependencies"]]
+
+
+def test_a_needed_package_that_is_too_old_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, "_versions")
+    monkeypatch.setattr(doctor, "_needed", lambda: [Requirement("numpy>=999")])
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 1
+    assert ", where >=999 is needed -> Run: pip install" in result.stdout
 
 
 def test_missing_optional_packages_name_their_extra(monkeypatch: pytest.MonkeyPatch) -> None:
