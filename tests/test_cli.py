@@ -49,7 +49,7 @@ def refused(*arguments: str | Path) -> str:
     return lines[0]
 
 
-COMMANDS = ["run", "collect", "learn", "evaluate", "diagnose", "plot", "export", "doctor"]
+COMMANDS = ["run", "reproduce", "collect", "learn", "evaluate", "diagnose", "plot", "export", "doctor"]
 DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
 
 
@@ -65,7 +65,7 @@ def test_every_command_has_help_with_examples(command: str) -> None:
     assert result.exit_code == 0
     assert "Usage: " in plain(result)
     assert f"mpcoffline {command}" in re.split("Examples?:", plain(result))[1]
-    if command in ("run", "collect", "learn", "evaluate"):
+    if command in ("run", "reproduce", "collect", "learn", "evaluate"):
         assert "--seed" in plain(result)
 
 
