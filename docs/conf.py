@@ -11,6 +11,9 @@ import tempfile
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
+from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
+
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(DOCS / "_ext"))
@@ -52,11 +55,12 @@ napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
 autodoc_type_aliases = {"ArrayLike": "ArrayLike", "NDArray": "NDArray"}  # as they are written, not expanded
+TypeAliasForwardRef.__repr__ = lambda self: self.name  # ... in unions, too
 autodoc_typehints = "description"
 autodoc_typehints_format = "short"
 autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True}
 
 # --- Notebooks ------------------------------------------------------------------------------------------------------
 
@@ -75,6 +79,7 @@ nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "build" / "notebooks" / _package_fingerprint())
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
+nb_execution_in_temp = True
 nb_execution_show_tb = True
 nb_merge_streams = True
 
@@ -86,6 +91,8 @@ os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp(prefix="mpcoffline-docs-")
 
 html_theme = "furo"
 html_title = "mpcoffline"
+html_logo = html_favicon = "_static/logo.svg"
+pygments_dark_style = "github-dark"
 html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 html_copy_source = False
@@ -101,3 +108,16 @@ for _name in ("tex-chtml-full.js", "output/chtml/fonts/woff-v2"):
         (shutil.copytree if _source.is_dir() else shutil.copy)(_source, _target)
 html_static_path.append(str(_STAGED))
 mathjax_path = "mathjax/tex-chtml-full.js"
+
+
+def _say_times(app: Sphinx, exception: Exception | None) -> None:
+    """How long each notebook took when it was executed."""
+    data = {page: found["exec_data"] for page, found in app.env.nb_metadata.items() if found.get("exec_data")}
+    times = {page: found["runtime"] for page, found in data.items() if found["runtime"] is not None}
+    lines = [f"{seconds:6.1f} s  {page}" for page, seconds in sorted(times.items())]
+    print(*lines, f"{sum(times.values()):6.1f} s  all {len(times)} notebooks", sep="\n")  # noqa: T201
+
+
+def setup(app: Sphinx) -> None:
+    """Says the times when the site is built."""
+    app.connect("build-finished", _say_times)

@@ -19,7 +19,7 @@ class CommandHelp(Directive):
 
     def run(self) -> list[nodes.Node]:
         """The sections, and one before them for the program itself."""
-        runner = CliRunner(env={"COLUMNS": "92", "NO_COLOR": "1", "TERM": "dumb", "TERMINAL_WIDTH": "92"})
+        runner = CliRunner(env={"COLUMNS": "86", "NO_COLOR": "1", "TERM": "dumb", "TERMINAL_WIDTH": "86"})
         sections: list[nodes.Node] = []
         for path in _commands(typer.main.get_command(program)):
             text = runner.invoke(program, [*path, "--help"], prog_name="mpcoffline", catch_exceptions=False).output

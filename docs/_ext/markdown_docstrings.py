@@ -1,4 +1,4 @@
-"""What autodoc cannot read of our docstrings: the environments' Markdown, as Gymnasium writes it, and types like bool_."""
+"""What autodoc cannot read of our docstrings: the environments' Markdown, as Gymnasium writes it, and ``bool_``."""
 
 from __future__ import annotations
 
