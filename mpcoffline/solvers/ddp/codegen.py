@@ -50,6 +50,8 @@ _FORMATS = {
 # GCC's effort grows with the square of a function's length. Only functions of costs that are networks are so long.
 _LONGEST = 2500
 _PIECE = 500
+# Inlined, the time of a cart-pole's expansion depends on where the linker puts it, by a quarter.
+_ATTRIBUTES = {"gen_q": "NOINLINE "}
 
 
 def source(mpc: MPC) -> str:
@@ -103,7 +105,10 @@ def generated(mpc: MPC) -> str:
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
         emit("gen_prepare", [theta], prepared),
-        *(emit(name, [*inputs[name], parameters], body) for name, body in zip(outputs, bodies, strict=True)),
+        *(
+            emit(name, [*inputs[name], parameters], body, _ATTRIBUTES.get(name, ""))
+            for name, body in zip(outputs, bodies, strict=True)
+        ),
     ]
     return "\n\n".join(parts)
 
@@ -170,8 +175,10 @@ def _stacked(*parts: ca.SX) -> ca.SX:
     return ca.vertcat(*(ca.vec(ca.densify(part)) for part in parts))
 
 
-def emit(name: str, inputs: list[ca.SX], output: ca.SX) -> str:
+def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> str:
     """One C function ``name(i0, i1, ..., out)`` of vectors of doubles; a long one calls pieces of itself in turn.
+
+    The attribute stands in front of it, e.g. ``"NOINLINE "``.
 
     Raises:
         InvalidArgumentError: For an operation without a counterpart in C.
@@ -181,7 +188,7 @@ def emit(name: str, inputs: list[ca.SX], output: ca.SX) -> str:
     pointers = [f"i{k}" for k in range(len(inputs))]
     arguments = "".join(f"const vd *{pointer}, " for pointer in pointers) + "vd *out"
     if len(program) <= _LONGEST:
-        return _function(name, arguments, _statements(name, program, len(program)), pointers)
+        return _function(name, arguments, _statements(name, program, len(program)), pointers, attribute)
     work, pieces, calls = f"vd w[{function.sz_w()}];", [], []
     statements = _statements(name, program, _PIECE)
     for k, start in enumerate(range(0, len(program), _PIECE)):
