@@ -99,7 +99,7 @@ def evaluate(
     each = [options or {}] * n_episodes if options is None or isinstance(options, dict) else list(options)
     if len(each) != n_episodes:
         raise InvalidArgumentError("options", expected=f"{n_episodes} entries", actual=str(len(each)))
-    if isinstance(gym.make(spec).unwrapped, ControlTask) and spec.vector_entry_point and not spec.additional_wrappers:
+    if spec.vector_entry_point and not spec.additional_wrappers and _is_our_task(spec):
         return _evaluate_as_arrays(policy, spec, each, seed, discount)
     return _evaluate_one_by_one(policy, spec, each, seed, discount)
 
@@ -155,6 +155,12 @@ def _evaluate_one_by_one(
         states=[np.array(episode.states) for episode in episodes],
         actions=[np.array(episode.actions) for episode in episodes],
     )
+
+
+def _is_our_task(spec: EnvSpec) -> bool:
+    env: gym.Env[Any, Any] = gym.make(spec)
+    env.close()
+    return isinstance(env.unwrapped, ControlTask)
 
 
 def _registered(env_id: str) -> EnvSpec | None:

@@ -241,7 +241,7 @@ class OfflineMPCLearner:
         space = self._observation_space
         document = {
             "nominal": self.nominal_mpc.to_json(),
-            "learned": None if self.result is None else self.mpc.to_json(),
+            "learned": None if self._mpc is None else self._mpc.to_json(),
             "learn": self.learn,
             "preset": self.preset,
             "value_given": self._given_value_function is not None,
@@ -268,9 +268,10 @@ class OfflineMPCLearner:
             learner = cls(nominal, document["learn"], document["preset"], document["seed"], device=document["device"])
             learner.config = LearnerConfig.from_json(document["config"])
             learner.history = [(int(epoch), dict(metrics)) for epoch, metrics in document["history"]]
-            if document["result"] is not None:
+            if document["learned"] is not None:
                 learner._mpc = MPC.from_json(document["learned"])
-                learner.result = FitResult.from_json(document["result"], learner._mpc.theta)
+            if document["result"] is not None:
+                learner.result = FitResult.from_json(document["result"], learner.mpc.theta)
             if document["observation_space"] is not None:
                 learner._observation_space = box_from_json(document["observation_space"])
             if arrays:

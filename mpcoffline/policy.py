@@ -148,8 +148,14 @@ class MPCPolicy(BasePolicy):
             one that takes observations as they are.
         """
         policy = copy.copy(self)
+        policy._solver = self._solver  # a copy alone would build its own
+        policy._noise_generator = copy.deepcopy(self._noise_generator)  # whose draws would otherwise be shared out
         policy._vec_normalize = None if vec_env is None else unwrap_vec_normalize(vec_env)
         return policy
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the solver, which is compiled code: a copy builds its own when first used."""
+        return self.__dict__ | {"_solver": None}
 
     @property
     def solver(self) -> Solver:

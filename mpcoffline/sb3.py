@@ -150,7 +150,7 @@ class MPCModel(BaseAlgorithm):
             "MPCModel.set_parameters",
             expected="an MPC, which has no networks",
             actual="parameters of networks",
-            hint="Use MPCModel.load(path), or MPCPolicy(mpc.replace(theta=theta)).",
+            hint="Use MPCModel.load(path), or MPCPolicy(mpc.with_theta(theta)).",
         )
 
     def save(  # type: ignore[override]

@@ -172,7 +172,11 @@ class Countdown(gym.Env[NDArray[Any], NDArray[Any]]):
     observation_space = spaces.Box(-10, 10, (1,), np.float64)
     action_space = spaces.Box(-1, 1, (1,), np.float32)
     left = 0
+    opened = 0
     closed = 0
+
+    def __init__(self) -> None:
+        type(self).opened += 1
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
@@ -192,7 +196,7 @@ class Countdown(gym.Env[NDArray[Any], NDArray[Any]]):
 @pytest.fixture
 def countdown() -> Iterator[str]:
     gym.register("test/Countdown-v0", entry_point=lambda: Countdown(), disable_env_checker=True)
-    Countdown.closed = 0
+    Countdown.opened = Countdown.closed = 0
     yield "test/Countdown-v0"
     gym.registry.pop("test/Countdown-v0")
 
@@ -208,6 +212,7 @@ def test_episodes_of_different_lengths(countdown: str) -> None:
     assert [len(states) for states in result.states] == [3, 4, 5]
     assert len(policy.calls) == 4
     assert Countdown.closed >= 3
+    assert Countdown.closed == Countdown.opened
 
 
 def test_a_policy_never_sees_what_comes_after_the_end(countdown: str) -> None:

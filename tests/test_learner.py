@@ -472,6 +472,22 @@ def test_a_loaded_learner_learns_as_a_new_one(tmp_path: Path) -> None:
     same_fit(loaded, fitted(lq_plant.random_log(400, seed=2)))
 
 
+def test_a_fit_that_a_callback_ended_keeps_what_it_learned(tmp_path: Path) -> None:
+    learner = quick()
+    learner.fit(
+        lq_plant.random_log(400),
+        n_steps_per_epoch=20,
+        callbacks=[lambda learner, epoch, total_step: total_step < 80],  # 60 steps are (VALUE)'s
+        show_progress=False,
+    )
+    assert learner.result is None
+    assert np.abs(learner.theta - learner.nominal_mpc.theta).max() > 0.0
+    learner.save(tmp_path / "l.zip")
+    loaded = OfflineMPCLearner.load(tmp_path / "l.zip")
+    assert loaded.result is None
+    same_fit(learner, loaded)
+
+
 def test_a_learner_can_be_saved_before_it_has_learned(tmp_path: Path) -> None:
     quick(seed=2).save(tmp_path / "l.zip")
     loaded = OfflineMPCLearner.load(tmp_path / "l.zip")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import pickle
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -439,6 +441,29 @@ def test_narrower_action_bounds_than_the_mpcs_hold(linear: MPCPolicy) -> None:
     x = np.array([[1.0, 1.0], [-1.0, -1.0]])
     np.testing.assert_array_equal(policy.predict(x)[0], [[-0.5], [0.25]])
     assert np.abs(linear.predict(x)[0]).min() > 1.0
+
+
+# ---------------------------------------------------------------- copies
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, lambda p: pickle.loads(pickle.dumps(p))])
+def test_a_policy_that_has_acted_can_be_copied(pendulum: MPCPolicy, copied: Callable[[MPCPolicy], MPCPolicy]) -> None:
+    y = observations(2, seed=3)
+    expected, _ = pendulum.predict(y)
+    again = copied(pendulum)
+    np.testing.assert_array_equal(again.predict(y)[0], expected)
+    assert again.solver is not pendulum.solver
+
+
+def test_a_policy_for_normalised_observations_has_noise_of_its_own() -> None:
+    mpc, y = lq_plant.make_mpc(), np.zeros((3, 2))
+    policy, untouched = MPCPolicy(mpc, seed=4), MPCPolicy(mpc, seed=4)
+    solver, other = policy.solver, policy.with_normalization(None)
+    assert other.solver is solver
+    other.predict(y, deterministic=False)
+    np.testing.assert_array_equal(
+        policy.predict(y, deterministic=False)[0], untouched.predict(y, deterministic=False)[0]
+    )
 
 
 # ---------------------------------------------------------------- files

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -137,10 +137,6 @@ class AgentScore:
     worst_cost: float
     discounted_cost: float
     success: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
-        return asdict(self)
 
 
 def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed: int = 10_000) -> list[AgentScore]:

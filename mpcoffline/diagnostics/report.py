@@ -149,14 +149,15 @@ class Report:
         """Draws the report.
 
         Args:
-            path: Where; PDF and PNG are written, whatever the suffix.
+            path: Where; PDF and PNG are written, whichever of them it names.
 
         Returns:
             The files.
         """
         from .figure import draw
 
-        return draw(self, Path(path).with_suffix(""))
+        stem = Path(path)
+        return draw(self, stem.with_suffix("") if stem.suffix.lower() in (".pdf", ".png") else stem)
 
 
 def _numbers(values: tuple[float, ...]) -> str:

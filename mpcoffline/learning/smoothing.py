@@ -296,7 +296,7 @@ def _likelihood(problem: Trajectories, theta: Array, noise: NoiseEstimate) -> fl
 
 
 def _smoothed_states(problem: Trajectories, theta: Array, noise: NoiseEstimate) -> Array:
-    """S and s+ of every row, ``(2, n, nx)``; those that come out far from what was measured stay as they were."""
+    """States s and s+ of every row, ``(2, n, nx)``; what comes out far from what was measured stays as it was."""
     x = problem.measured
     for _ in range(_SMOOTHINGS):
         x = smoothed(filtered(problem.linearised(theta, x), *_filter_noise(problem, noise)))

@@ -104,7 +104,7 @@ class Constraint:
 
 @dataclass(frozen=True, eq=False)
 class StateBounds:
-    """Low <= x_k <= high for k = 1 ... N; the initial state is given, so it is not asked.
+    """Bounds low <= x_k <= high for k = 1 ... N; the initial state is given, so it is not asked.
 
     Args:
         low: Lower bounds, ``(nx,)``; ``-inf`` where there are none.

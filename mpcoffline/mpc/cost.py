@@ -102,7 +102,7 @@ class QuadraticCost(Component):
         return cost
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
-        """E'We + constant as a CasADi scalar."""
+        """The terminal cost e'We + constant as a CasADi scalar."""
         e = self._error(x, p)
         factor = p["W"] if "W" in p else p["H"][: e.numel(), :]
         return ca.sumsqr(factor.T @ e) + p["constant"]

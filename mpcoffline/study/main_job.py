@@ -59,7 +59,8 @@ def run_task(
         dataset: Minari id of the data; the task's DDPG data by default.
         n_episodes: Closed-loop episodes of each controller.
         output: Folder for table and figure.
-        value: ``"residual"`` (the published one, default), ``"td"`` or ``"expectile"``.
+        value: Name of a value method, see :class:`~mpcoffline.OfflineMPCLearner`; the preset's by default, which is
+            ``"residual"``, the published one, for ``"paper"``.
         progress: Whether to draw progress bars.
         **learner_options: Further arguments of :class:`~mpcoffline.OfflineMPCLearner`, e.g. ``prior=1e-2``.
 

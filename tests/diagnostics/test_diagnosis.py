@@ -69,6 +69,10 @@ def test_the_figure_is_drawn(good: Report, tmp_path: Path) -> None:
     assert again[0].read_bytes() == files[0].read_bytes()
 
 
+def test_a_point_in_the_figures_name_is_no_suffix(good: Report, tmp_path: Path) -> None:
+    assert [file.name for file in good.figure(tmp_path / "fit.0.95")] == ["fit.0.95.pdf", "fit.0.95.png"]
+
+
 def test_the_same_seed_gives_the_same_report(good: Report) -> None:
     assert diagnose(fitted(WRONG), LOG, n_starts=8, n_steps=40).to_json() == good.to_json()
 
