@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
@@ -65,6 +66,10 @@ class Fit:
         device: Torch device for (VALUE).
         value_function: A V_phi learned before; (VALUE) is skipped.
 
+    Raises:
+        InvalidDataError: For data of other sizes than the MPC's, or beyond its bounds.
+        InvalidArgumentError: For a device that this machine has not, or a V_phi of another discount than the fit's.
+
     Attributes:
         learned: The MPC as far as it is learned; None before the first epoch of (FIT).
         value_function: V_phi, once it is learned.
@@ -87,6 +92,7 @@ class Fit:
         self._seed, self._device = seed, device
         _check_device(device)
         self._nominal, self._mpc = nominal, restructured(nominal, config)
+        _check_discount(value_function, self._mpc.discount)
         self.learned: MPC | None = None
         self.value_function = value_function
         self.result: FitResult | None = None
@@ -241,6 +247,18 @@ def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
 def _some_rows(n: int, most: int) -> NDArray[np.int64]:
     """Row numbers in order, at most so many, the same at each call; a stride would meet the length of episodes."""
     return np.sort(np.random.default_rng(0).permutation(n)[:most])
+
+
+def _check_discount(value_function: ValueFunction | None, discount: float) -> None:
+    """Refuses a V_phi of another gamma; a V_phi that knows none is the caller's word."""
+    known = None if value_function is None else value_function.discount
+    if known is not None and not math.isclose(known, discount, rel_tol=1e-6):
+        raise InvalidArgumentError(
+            "value_function",
+            expected=f"one learned with the discount of this fit, {discount:g}",
+            actual=f"one of {known:g}",
+            hint=f"Pass discount={known:g} to the learner, or let it learn V anew.",
+        )
 
 
 def _check_device(device: str) -> None:

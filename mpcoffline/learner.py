@@ -136,7 +136,7 @@ class OfflineMPCLearner:
 
         Raises:
             InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
-            InvalidArgumentError: If the checkpoint is of another fit.
+            InvalidArgumentError: If the checkpoint is of another fit, or the given V_phi of another discount.
             UnknownIdError: For an unknown data set id.
         """
         for _ in self.fitter(

@@ -219,6 +219,17 @@ def test_a_given_value_function_is_used_as_it_is() -> None:
     assert [set(metrics) for _, metrics in history] == [{"fit_loss"}]
 
 
+def test_a_value_function_of_another_discount_is_refused() -> None:
+    table = lq_plant.random_log(200)
+    value = fitted(table).value_function
+    assert value is not None
+    assert value.discount == lq_plant.DISCOUNT
+    message = r"value_function: expected .* of this fit, 0\.95, got one of 0\.9\."
+    with pytest.raises(InvalidArgumentError, match=message):
+        quick(preset="default", value_function=value).fit(table, show_progress=False)
+    quick(value_function=value, learn="cost").fit(table, show_progress=False)
+
+
 @pytest.mark.parametrize("preset", ["paper", "default"])
 def test_the_tails_are_left_out(preset: str) -> None:
     """A tenth of the rows lies far out with absurd costs: with the default trim they count for nothing."""

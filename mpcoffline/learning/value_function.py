@@ -39,15 +39,21 @@ class ValueFunction(nn.Module):
     std: Tensor
     offset: Tensor
     scale: Tensor
+    gamma: Tensor
 
     def __init__(self, ny: int, hidden: Sequence[int] = (256, 256), n_members: int = 1) -> None:
         super().__init__()
         self.ny, self.hidden, self.n_members = ny, tuple(hidden), n_members
         members = [tanh_network(ny, self.hidden) for _ in range(n_members)]
         self.net: nn.Module = members[0] if n_members == 1 else Mean(members)
-        for name, size in (("mean", (ny,)), ("std", (ny,)), ("offset", ()), ("scale", ())):
-            fill = 0.0 if name in ("mean", "offset") else 1.0
+        for name, size in (("mean", (ny,)), ("std", (ny,)), ("offset", ()), ("scale", ()), ("gamma", ())):
+            fill = 1.0 if name in ("std", "scale") else 0.0
             self.register_buffer(name, torch.full(size, fill, dtype=torch.float64))
+
+    @property
+    def discount(self) -> float | None:
+        """The gamma that V was learned with; None where it was not learned, or is of a file that does not say."""
+        return float(self.gamma) or None
 
     @property
     def members(self) -> list[nn.Sequential]:
@@ -61,6 +67,7 @@ class ValueFunction(nn.Module):
         """
         mean, std, low, high = table.statistics()
         largest = np.maximum(np.abs(low.observations), np.abs(high.observations))
+        self.gamma.fill_(discount)
         self.mean.copy_(torch.from_numpy(mean.observations))
         self.std.copy_(torch.from_numpy(np.where(std.observations > _ROUNDING * largest, std.observations, 1.0)))
         goes_on = 1.0 - float(mean.terminations)
@@ -110,7 +117,8 @@ class ValueFunction(nn.Module):
             n_linear = sum(name.startswith(first) and name.endswith(".weight") for name in arrays)
             hidden = [len(arrays[f"{first}{2 * i}.weight"]) for i in range(n_linear - 1)]
             value = cls(len(arrays["mean"]), hidden, max(1, n_members))
-            value.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in arrays.items()})
+            known = {"gamma": np.zeros(())} | dict(arrays)  # older files do not tell it
+            value.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in known.items()})
         except (IndexError, KeyError, RuntimeError, TypeError, MPCOfflineError) as error:
             raise FileFormatError("value function", expected="weights of a network", actual=str(error)) from error
         if not all(np.isfinite(array).all() for array in arrays.values()):

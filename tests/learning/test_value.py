@@ -190,6 +190,16 @@ def test_arrays_hold_the_whole_function() -> None:
         np.testing.assert_array_equal(array, arrays[name])
 
 
+def test_the_discount_is_kept_and_may_be_unknown() -> None:
+    value = fit_value(lq_plant.random_log(50), 0.93, ValueConfig(hidden=(4,), n_steps=1), seed=0)
+    assert value.discount == 0.93
+    arrays = value.to_arrays()
+    assert ValueFunction.from_arrays(arrays).discount == 0.93
+    del arrays["gamma"]  # as in files from before it was kept
+    assert ValueFunction.from_arrays(arrays).discount is None
+    assert ValueFunction(2).discount is None
+
+
 @pytest.mark.parametrize("damage", ["missing", "shape", "foreign", "empty", "kind", "scalar", "nan"])
 def test_damaged_arrays_are_refused(damage: str) -> None:
     arrays: dict[str, NDArray[Any]] = ValueFunction(2, (4, 4)).to_arrays()
