@@ -1,22 +1,36 @@
-"""Installs a built wheel into a new environment outside the repository and tries it: check_wheel.py FOLDER.
+"""Installs a built wheel outside the repository and tries it there: check_wheel.py FOLDER [PYTHON].
 
-FOLDER/dist holds the wheel. The environment borrows the dependencies of the one that runs this script by a path file,
-so that nothing is downloaded; the editable install there does not reach it, as path files do not nest.
+FOLDER/dist holds wheel and sdist. PYTHON is that of an environment with the dependencies; without it a new one is made
+that borrows those of the environment which runs this script by a path file, so that nothing is downloaded; the editable
+install there does not reach it, as path files do not nest.
+
+Tried are: the contents of the sdist, the metadata as an index sees it, the import, the command line, the README's quick
+start (with a short regression), and scripts/users_script.py, which is run, and type-checked together with the quick
+start.
 """
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
+import tarfile
+import time
 import venv
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[1]
+
 TRIAL = """
-import importlib.util, pathlib, sys
+import importlib.metadata, importlib.util, pathlib, sys
+for extra in ("pygame", "moviepy", "tensorboard", "huggingface_hub", "google.cloud.storage", "tensordict", "torchrl"):
+    sys.modules[extra] = None  # as if it were not installed
 import gymnasium as gym
 import mpcoffline
 here = pathlib.Path(sys.argv[1])
 assert here in pathlib.Path(mpcoffline.__file__).parents, mpcoffline.__file__
+assert mpcoffline.__version__ == importlib.metadata.version("mpcoffline")
 assert not {"torch", "casadi", "stable_baselines3", "minari"} & set(sys.modules), "import mpcoffline is not light"
 for name in ("envs", "datasets"):
     spec = importlib.util.find_spec(name)
@@ -32,25 +46,95 @@ assert mpcoffline.load_dataset("mpcoffline/linear/ddpg-v0").total_episodes == 50
 print("mpcoffline", mpcoffline.__version__, "works from its wheel")
 """
 
+# Runs a script; what is deprecated in a dependency and still called from here is an error.
+RUN = r"""
+import runpy, sys, warnings
+warnings.filterwarnings("error", category=DeprecationWarning, module=r"mpcoffline(\.|$)")
+runpy.run_path(sys.argv[1], run_name="__main__")
+"""
 
-def main(scratch: Path) -> None:
+
+def main(scratch: Path, python: Path | None) -> None:
     wheel, sdist = (next((scratch / "dist").glob(pattern)) for pattern in ("*.whl", "*.tar.gz"))
-    home = scratch / "venv"
-    venv.create(home, with_pip=False)
-    python = home / "bin" / "python"
-    subprocess.run([sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps", wheel], check=True)
-    where = [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
-    packages = Path(subprocess.run(where, check=True, capture_output=True, text=True).stdout.strip())
-    (packages / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    store = scratch / "wheel-minari"
-    store.mkdir()
-    environment = {"MINARI_DATASETS_PATH": str(store), "PATH": os.environ["PATH"], "HOME": str(scratch)}
-    subprocess.run([python, "-c", TRIAL, home], check=True, cwd=scratch, env=environment)
-    for arguments in (["--version"], ["run", "--help"], ["datasets", "list"]):
-        command = [home / "bin" / "mpcoffline", *arguments]
-        subprocess.run(command, check=True, cwd=scratch, env=environment, stdout=subprocess.DEVNULL)
+    check_sdist(sdist)
+    step("twine", [sys.executable, "-m", "twine", "check", "--strict", wheel, sdist])
+    if python is None:
+        python = borrowing_environment(scratch / "venv")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python]
+    step("installation", [*pip, "install", "-q", "--no-deps", "--force-reinstall", wheel])
+    try_wheel(python, scratch / "trial")
     print(f"{wheel.name} ({wheel.stat().st_size / 1e6:.1f} MB), {sdist.name} ({sdist.stat().st_size / 1e6:.1f} MB)")
 
 
+def check_sdist(sdist: Path) -> None:
+    """The sdist holds what is tracked, so that tests, checks and documentation can be made from it."""
+    if not (ROOT / ".git").exists():
+        return
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    with tarfile.open(sdist) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    # The two links are for editors; package-dir takes their place.
+    left_out = {".ci/run", ".gitignore", "mpcoffline/envs", "mpcoffline/datasets/catalog"}
+    if missing := set(tracked) - held - left_out:
+        raise SystemExit(f"check_wheel.py: expected all tracked files in {sdist.name}, missing: {sorted(missing)}")
+
+
+def borrowing_environment(home: Path) -> Path:
+    """A new environment with the packages of this one; its Python."""
+    venv.create(home, with_pip=False)
+    python = home / "bin" / "python"
+    (packages_of(python) / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return python
+
+
+def packages_of(python: Path) -> Path:
+    """Where an environment has its packages."""
+    where = [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+    return Path(subprocess.run(where, check=True, capture_output=True, text=True).stdout.strip())
+
+
+def try_wheel(python: Path, folder: Path) -> None:
+    """All trials, in a new folder that is the user's home and store of data sets."""
+    (folder / "minari").mkdir(parents=True)
+    environment = {"PATH": os.environ["PATH"], "HOME": str(folder), "MINARI_DATASETS_PATH": str(folder / "minari")}
+    environment |= {"OMP_NUM_THREADS": "1", "COLUMNS": "100"}
+    (folder / "users_script.py").write_text((ROOT / "scripts" / "users_script.py").read_text())
+    (folder / "quick_start.py").write_text(quick_start())
+
+    def trial(name: str, *command: str | Path) -> None:
+        step(name, list(command), cwd=folder, env=environment)
+
+    # Without the project's configuration: what is checked is what a stranger's mypy sees, through py.typed.
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--python-executable", python]
+    background = ThreadPoolExecutor(1)
+    types = background.submit(trial, "user's types", *mypy, "quick_start.py", "users_script.py")
+    trial("import", python, "-W", "error::DeprecationWarning", "-c", "import mpcoffline")
+    trial("wheel", python, "-c", TRIAL, packages_of(python).parents[2])
+    for arguments in (["--version"], ["run", "--help"], ["datasets", "list"]):
+        trial(f"mpcoffline {' '.join(arguments)}", python.parent / "mpcoffline", *arguments)
+    trial("quick start", python, "-c", RUN, "quick_start.py")
+    trial("user's script", python, "-c", RUN, "users_script.py")
+    types.result()
+
+
+def quick_start() -> str:
+    """The README's first block of Python, with a regression of a few seconds."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    block = re.findall(r"^```python\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)[0]
+    brief, n_changed = re.subn(r"(OfflineMPCLearner\(mpc, .*?)\)", r"\1, value_n_steps=500, fit_n_steps=200)", block)
+    if n_changed != 1:
+        raise SystemExit("check_wheel.py: expected one learner in the README's first block of Python.")
+    return brief
+
+
+def step(name: str, command: list[str | Path], **options: object) -> None:
+    """Runs a command; its output is shown where it fails."""
+    start = time.perf_counter()
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)  # type: ignore[call-overload]
+    if done.returncode:
+        raise SystemExit(f"{done.stdout}\ncheck_wheel.py: {name} failed with exit code {done.returncode}.")
+    print(f"  {name}: {time.perf_counter() - start:.1f} s", flush=True)
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve())
+    main(Path(sys.argv[1]).resolve(), Path(sys.argv[2]).absolute() if len(sys.argv) > 2 else None)
