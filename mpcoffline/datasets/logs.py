@@ -226,6 +226,7 @@ def from_csv(
     split_gaps: bool = False,
     delimiter: str = ",",
     dataset_id: str | None = None,
+    overwrite: bool = False,
 ) -> TransitionTable:
     """Reads the log of a real plant: a text table with a header, one row a sampling instant.
 
@@ -243,12 +244,13 @@ def from_csv(
         split_gaps: Whether a row at another distance begins a new episode instead of being an error.
         delimiter: What separates columns.
         dataset_id: Also stores the log as a Minari data set of this id.
+        overwrite: Whether an existing data set of this id may be replaced.
 
     Returns:
         The transitions.
 
     Raises:
-        InvalidArgumentError: For ``time`` without ``dt`` or the reverse, no columns, or a bad id.
+        InvalidArgumentError: For ``time`` without ``dt`` or the reverse, no columns, or a bad id or one that exists.
         InvalidDataError: For a missing column, a cell that is not a finite number, rows that do not follow each other
             by ``dt``, an episode in two pieces, or costs of another shape; names line and column.
     """
@@ -301,6 +303,7 @@ def from_csv(
             dataset_id,
             [(s[k[0] : k[-1] + 2], a[k], c) for k, c in zip(pieces, parts, strict=True)],
             description=f"Log {Path(path).name}.",
+            overwrite=overwrite,
         )
     return table
 

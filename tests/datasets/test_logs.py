@@ -139,6 +139,15 @@ def test_the_log_of_a_plant(log: Path) -> None:
     np.testing.assert_array_equal(stored.episode_ids, table.episode_ids)
 
 
+def test_a_log_is_stored_anew_on_request_only(log: Path) -> None:
+    from_csv(log, **COLUMNS, cost=cost, dataset_id="test/plant-v0")
+    with pytest.raises(InvalidArgumentError, match="overwrite=True"):
+        from_csv(log, **COLUMNS, cost=lambda s, a: cost(s, a) + 1.0, dataset_id="test/plant-v0")
+    table = from_csv(log, **COLUMNS, cost=lambda s, a: cost(s, a) + 1.0, dataset_id="test/plant-v0", overwrite=True)
+    np.testing.assert_allclose(table.costs, [2.25, 2.37, 27.0], rtol=1e-6)
+    np.testing.assert_array_equal(TransitionTable.from_minari("test/plant-v0").rows, table.rows)
+
+
 def test_costs_from_a_column_gaps_and_other_delimiters(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_text("t;x;u;l\n0;1;0;7\n1;2;0;8\n5;3;0;9\n6;4;0;10\n")
