@@ -2,7 +2,7 @@
 
 /* Iterates from w->x, w->u; J = INFINITY says that w->x need not obey the model. Returns one of the states above. */
 static int solve(const mpc_problem *m, lanes *w) {
-    w->mu = 0.0;
+    w->mu = w->alpha = 0.0;
     for (int64_t k = 1; k <= m->max_iterations; ++k) {
         vl converged, moved, stalled;
         iterate(m, w, -1, &converged, &moved, &stalled);
@@ -23,50 +23,43 @@ static void keep(mpc_state *state, const lanes *w) {
     for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->x[i] = w->x[i];
 }
 
-/* Solves from MPC_STARTS starts, each the cheapest of its share of the candidates: a few iterations each, the best go
- * on, the best solution is kept. Returns whether there is one. */
-static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
-    double J[N_CANDIDATES], lead[FINALISTS(MPC_STARTS)], best = INFINITY;
-    int best_converged = 0;
+/* From one of the candidates, for a few iterations. */
+static void start(const mpc_problem *m, lanes *w, int c) {
     mpc_problem race = *m;
     if (race.max_iterations > RACE_ITERATIONS) race.max_iterations = RACE_ITERATIONS;
+    for (int k = 0; k < MPC_HORIZON; ++k)
+        for (int a = 0; a < NU; ++a) w->u[k * NU + a] = clip(candidate(c, k, a), m->low[a], m->high[a]);
+    w->J = rollout_open(m, w, w->x, w->u);
+    solve(&race, w);
+    if (!(w->J < INFINITY)) w->J = INFINITY;
+}
+
+/* Solves from MPC_STARTS starts, each the cheapest of its share of the candidates: a few iterations each, the best go
+ * on (they are run again, which needs less memory than keeping all), the best solution is kept. Returns whether there
+ * is one. */
+static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
+    double J[N_CANDIDATES], raced[MPC_STARTS], best = INFINITY;
+    int cheapest[MPC_STARTS], best_converged = 0;
+    int64_t chosen[FINALISTS(MPC_STARTS)];
     for (int c = 0; c < N_CANDIDATES; ++c) {
         for (int k = 0; k < MPC_HORIZON; ++k)
             for (int a = 0; a < NU; ++a) w->u[k * NU + a] = candidate(c, k, a);
         J[c] = rollout_open(m, w, w->x, w->u);
         if (!(J[c] < INFINITY)) J[c] = INFINITY;
     }
-    for (int start = 0; start < MPC_STARTS; ++start) {
-        int cheapest = start * N_CANDIDATES / MPC_STARTS, place = start;
-        for (int c = cheapest; c < (start + 1) * N_CANDIDATES / MPC_STARTS; ++c)
-            if (J[c] < J[cheapest]) cheapest = c;
-        for (int k = 0; k < MPC_HORIZON; ++k)
-            for (int a = 0; a < NU; ++a)
-                w->u[k * NU + a] = clip(candidate(cheapest, k, a), m->low[a], m->high[a]);
-        w->J = rollout_open(m, w, w->x, w->u);
-        solve(&race, w);
-        if (!(w->J < INFINITY)) w->J = INFINITY;
-        if (start >= FINALISTS(MPC_STARTS)) { /* in place of the worst, if it is better */
-            place = 0;
-            for (int l = 1; l < FINALISTS(MPC_STARTS); ++l)
-                if (lead[l] > lead[place]) place = l;
-            if (!(w->J < lead[place])) continue;
-        }
-        lead[place] = w->J;
-        for (int i = 0; i < MPC_HORIZON * NU; ++i) state->start_u[place][i] = w->u[i];
-        for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->start_x[place][i] = w->x[i];
+    for (int l = 0; l < MPC_STARTS; ++l) {
+        cheapest[l] = l * N_CANDIDATES / MPC_STARTS;
+        for (int c = cheapest[l]; c < (l + 1) * N_CANDIDATES / MPC_STARTS; ++c)
+            if (J[c] < J[cheapest[l]]) cheapest[l] = c;
+        start(m, w, cheapest[l]);
+        raced[l] = w->J;
     }
+    choose_finalists(raced, MPC_STARTS, chosen);
     for (int l = 0; l < FINALISTS(MPC_STARTS); ++l) {
-        int first = 0;
-        for (int other = 1; other < FINALISTS(MPC_STARTS); ++other)
-            if (lead[other] < lead[first]) first = other;
-        lead[first] = INFINITY;
-        for (int i = 0; i < MPC_HORIZON * NU; ++i) w->u[i] = state->start_u[first][i];
-        for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w->x[i] = state->start_x[first][i];
-        w->J = INFINITY;
+        start(m, w, cheapest[chosen[l]]);
         int converged = solve(m, w) == CONVERGED;
         /* A converged solution that is as good as the best goes before one that is not. */
-        double slack = 1e-6 * (1.0 + fabs(best));
+        double slack = BEATEN * (1.0 + fabs(best));
         int closer = converged && !best_converged && w->J < best + slack;
         if (closer || w->J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY)) {
             best = w->J;

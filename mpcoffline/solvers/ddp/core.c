@@ -29,11 +29,15 @@ enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING 
 #define MU_MIN 1e-5
 #define MU_MAX 1e6
 #define ARMIJO 1e-4
+#define SHORTEST_STEP 0.5 /* of those tried first, when two steps in a row suggest a length other than 1 */
+#define LONGEST_STEP 5.0
 #define INPUT_TOLERANCE 3e-5
 #define ACCEPTABLE 1e3 /* times the tolerance is good enough once the iterations are used up */
 #define RIDGE 1e-12   /* keeps a singular Quu (an input that nothing depends on) invertible */
-#define RACE_ITERATIONS 4                 /* of each start of a cold solve, before the best go on */
+#define RACE_ITERATIONS 3 /* of each start of a cold solve, before the best go on */
 #define FINALISTS(starts) (((starts) + 3) / 4)
+#define DISTINCT 1e-2     /* starts whose costs differ by less, relative to 1 + |J|, most often lead to the same minimum */
+#define BEATEN 1e-4 /* relative to 1 + |J|: a solution better by less is not worth further iterations */
 #define NT (NX * (NX + 1) / 2)
 #define NZ (NX + NU)
 #define TRI(i, j) ((j) * ((j) + 1) / 2 + (i)) /* of an upper triangle, i <= j */
@@ -51,6 +55,7 @@ typedef struct {
     vd *k, *K;                 /* feedforward (N, NU), feedback (N, NU, NX) column-major */
     vd p[NP + NQ + 1], s[NX], low0[NU], high0[NU];
     vd J, J_new, mu, predicted, defect;
+    vd alpha, stretch;         /* length of the last step, 0 at first; the one that two steps in a row suggest */
     vl settled; /* lanes whose first input has settled */
     vl pd; /* lanes whose backward pass found a positive definite Quu */
 } lanes;
@@ -261,6 +266,14 @@ static void expand_stage(const vd *x, const vd *u, const vd *x_next, const vd *V
 #endif
 }
 
+/* The curvature of f, which Gauss-Newton leaves out, makes full steps too short or too long. Two steps k, k+ in a row
+ * show by how much, k+ = (1 - alpha a) k, and 1 / a would have reached the end were it the same in all directions:
+ * Barzilai and Borwein, doi:10.1093/imanum/8.1.141, in the metric of H. square = k'Hk, change = k'H(k - k+). */
+static vd stretch(vd alpha, vd square, vd change) {
+    vl known = vd_lt(V(0.0), alpha) & vd_lt(V(0.0), change);
+    return vd_select(known, clip(alpha * square / change, V(SHORTEST_STEP), V(LONGEST_STEP)), V(1.0));
+}
+
 /* Riccati recursion along (x, u): gains k, K, the predicted decrease of J, and where Quu was positive definite. */
 static void backward(const mpc_problem *m, lanes *w) {
     vd Vx[NX], Vxx[NT], out[NX + NX + NU + NT + NU * NX + NU * NU];
@@ -270,7 +283,7 @@ static void backward(const mpc_problem *m, lanes *w) {
     for (int i = 0; i < NT; ++i) Vxx[i] = out[NX + i];
     double weight = 1.0;
     for (int64_t k = 1; k < N; ++k) weight *= m->discount;
-    vd discount = V(m->discount);
+    vd discount = V(m->discount), square = V(0.0), change = V(0.0);
     w->pd = all_lanes();
     w->predicted = w->defect = V(0.0);
     for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
@@ -304,6 +317,9 @@ static void backward(const mpc_problem *m, lanes *w) {
         for (int a = 0; a < NU; ++a) {
             vd Quud = V(0.0);
             for (int b = 0; b < NU; ++b) Quud += Quu[b * NU + a] * d[b];
+            vd before = w->k[k * NU + a], size = weight * H[a][a] * before;
+            square += size * before;
+            change += size * (before - d[a]);
             w->k[k * NU + a] = d[a];
             gradient[a] = Qu[a] + Quud;
             slope += Qu[a] * d[a];
@@ -324,6 +340,27 @@ static void backward(const mpc_problem *m, lanes *w) {
             }
         }
     }
+    w->stretch = stretch(w->alpha, square, change);
+}
+
+/* The starts that go on after a race to costs J: the cheapest, then the cheapest of those that differ from all chosen
+ * before; places that are left go to the cheapest of the others. */
+static inline void choose_finalists(const double *J, int64_t n, int64_t *chosen) {
+    int64_t n_chosen = 0;
+    for (int distinct = 1; distinct >= 0; --distinct)
+        while (n_chosen < FINALISTS(n)) {
+            int64_t best = -1;
+            for (int64_t i = 0; i < n; ++i) {
+                int fits = !distinct || J[i] < INFINITY;
+                for (int64_t c = 0; c < n_chosen && fits; ++c) {
+                    double other = J[chosen[c]];
+                    fits = i != chosen[c] && (!distinct || fabs(J[i] - other) > DISTINCT * (1.0 + fabs(other)));
+                }
+                if (fits && (best < 0 || J[i] < J[best])) best = i;
+            }
+            if (best < 0) break;
+            chosen[n_chosen++] = best;
+        }
 }
 
 /* Takes over the new trajectory where the mask says so. */
@@ -351,24 +388,27 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
     backward(m, w);
     /* The cost can be flat where the policy is not: the first input must have settled too. */
     vl settled = all_lanes();
-    for (int a = 0; a < NU; ++a) settled &= vd_le(vd_abs(w->k[a]), INPUT_TOLERANCE * (1.0 + vd_abs(w->u[a])));
+    vd far = vd_max(w->stretch, V(1.0)); /* how much farther than the step the solution is */
+    for (int a = 0; a < NU; ++a) settled &= vd_le(far * vd_abs(w->k[a]), INPUT_TOLERANCE * (1.0 + vd_abs(w->u[a])));
     /* A step found with heavy regularisation promises little without being near a solution. */
     settled &= w->pd & vd_le(w->mu, V(1.0));
     w->settled = settled;
     /* A point is a solution when the model holds and the quadratic model promises no further decrease. */
     vl small = settled & vd_lt(vd_abs(w->J), V(INFINITY)) & vd_lt(w->predicted, m->tolerance * (1.0 + vd_abs(w->J)));
     vl open = all_lanes();
-    vd alpha = V(1.0);
+    vd alpha = vd_select(vd_le(w->mu, V(0.0)) & ~small, w->stretch, V(1.0));
+    w->alpha = V(0.0);
     *moved = no_lanes();
     for (int trial = 0; trial < MAX_BACKTRACKS; ++trial) {
         rollout(m, w, alpha);
         vl better = vd_lt(w->J_new, w->J - ARMIJO * alpha * vd_max(w->predicted, V(0.0)));
         better &= vd_lt(vd_abs(w->J_new), V(INFINITY)) & open & w->pd;
         accept(m, w, better);
+        w->alpha = vd_select(better, alpha, w->alpha);
         *moved |= better;
         open &= ~better & w->pd & ~small; /* the last step of a solution is tried once, at full length */
         if (!vl_any(open & wanted)) break;
-        alpha = alpha * 0.4;
+        alpha = vd_select(vd_lt(V(1.0), alpha), V(1.0), 0.4 * alpha);
     }
     /* A warm start that obeys the model is as good as a rollout, only its cost is not known before the step. */
     vl nearly = vd_lt(w->defect, V(1e-9)) & vd_lt(w->predicted, m->tolerance * (1.0 + vd_abs(w->J)));

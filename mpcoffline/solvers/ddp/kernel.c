@@ -25,6 +25,9 @@ static lanes *lanes_new(int64_t N) {
     return w;
 }
 
+/* What x_guess, u_guess are: a plan whose states need not obey the model, inputs alone, or a rollout that costs J. */
+enum { PLAN = 0, INPUTS = 1, ROLLOUT = 2 };
+
 /* One problem per lane; lane i works on problem queue[i] or on nothing (-1). */
 typedef struct {
     int64_t n;
@@ -32,8 +35,9 @@ typedef struct {
     int64_t theta_stride;          /* NP, or 0: one theta for all */
     double *x, *u, *J, *predicted; /* solution: (n, N+1, NX), (n, N, NU), (n), (n) */
     int64_t *iterations, *status;  /* (n) */
-    int cold;                      /* the guess is inputs only */
+    int guess;                       /* PLAN, INPUTS, or ROLLOUT */
     const double *x_guess, *u_guess; /* as x, u, and may be these */
+    int rivals;                      /* these are starts of one problem, of which only the best solution matters */
 } mpc_batch;
 
 /* One theta for all lanes. */
@@ -57,8 +61,8 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
     }
     for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
     for (int j = 0; j < NX; ++j) w->x[j][lane] = w->s[j][lane];
-    w->J[lane] = INFINITY;
-    w->mu[lane] = 0.0;
+    w->J[lane] = b->guess == ROLLOUT ? b->J[i] : INFINITY;
+    w->mu[lane] = w->alpha[lane] = 0.0;
 }
 
 static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w, int lane, int64_t i, int64_t status,
@@ -79,12 +83,18 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
     b->iterations[i] = iterations;
 }
 
+/* Whether what a start has reached and what it promises are no better than a solution of the same problem. */
+static int is_beaten(const lanes *w, int lane, double best) {
+    return best < INFINITY && !(w->J[lane] - 2.0 * w->predicted[lane] < best - BEATEN * (1.0 + fabs(best)));
+}
+
 /* Solves problems first, first + stride, ... of the batch; a lane that finishes takes the next one. */
 static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t stride) {
     lanes *w = lanes_new(m->horizon);
     if (!w) return 1;
     int64_t problem[LANES], count[LANES], next = first;
     int fresh_any, busy;
+    double best = INFINITY;
     if (!b->theta_stride) load_theta(w, b->theta);
     for (int l = 0; l < LANES; ++l) {
         problem[l] = -1;
@@ -105,7 +115,7 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
         }
         if (!busy) break;
         if (fresh_any && b->theta_stride) gen_prepare(w->p, w->p + NP);
-        if (fresh_any && b->cold) {
+        if (fresh_any && b->guess == INPUTS) {
             vd J = rollout_open(m, w, w->x_new, w->u);
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
             w->J = vd_select(fresh, J, w->J);
@@ -119,6 +129,8 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             ++count[l];
             if (status == RUNNING && count[l] >= m->max_iterations)
                 status = acceptable(m, w)[l] ? CONVERGED : ITERATION_LIMIT;
+            if (b->rivals && status == CONVERGED && w->J[l] < best) best = w->J[l];
+            if (b->rivals && status == RUNNING && is_beaten(w, l, best)) status = ITERATION_LIMIT;
             if (status != RUNNING) {
                 store_lane(m, b, w, l, problem[l], status, count[l]);
                 problem[l] = -1;
@@ -147,6 +159,23 @@ int mpc_solve(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t s
     return solve_range(m, b, first, stride);
 }
 
+/* Takes the start of each share of the candidates, its cheapest one; shares of one need no comparison. */
+static void choose_starts(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
+                          int64_t n_candidates, double *J, lanes *w, mpc_batch *starts) {
+    int64_t N = m->horizon;
+    const double *u0 = b->u0 ? b->u0 + i * NU : NULL;
+    int compare = n_candidates > starts->n;
+    if (compare) candidate_costs(m, w, b->x0 + i * NX, starts->theta, u0, candidates, n_candidates, J);
+    for (int64_t l = 0; l < starts->n; ++l) {
+        int64_t cheapest = l * n_candidates / starts->n;
+        for (int64_t c = cheapest; compare && c < (l + 1) * n_candidates / starts->n; ++c)
+            if (J[c] < J[cheapest]) cheapest = c;
+        memcpy(starts->u + l * N * NU, candidates + cheapest * N * NU, N * NU * sizeof(double));
+        memcpy((double *)starts->x0 + l * NX, b->x0 + i * NX, NX * sizeof(double));
+        if (u0) memcpy((double *)starts->u0 + l * NU, u0, NU * sizeof(double));
+    }
+}
+
 static void swap(double *a, double *b, int64_t n) {
     for (int64_t k = 0; k < n; ++k) {
         double kept = a[k];
@@ -155,47 +184,47 @@ static void swap(double *a, double *b, int64_t n) {
     }
 }
 
+/* Moves the starts that a few iterations show to lead somewhere, and elsewhere, to the front. */
+static int race(const mpc_problem *m, mpc_batch *starts, int64_t *chosen, int64_t *iterations) {
+    int64_t N = m->horizon;
+    mpc_problem short_one = *m;
+    if (short_one.max_iterations > RACE_ITERATIONS) short_one.max_iterations = RACE_ITERATIONS;
+    if (solve_range(&short_one, starts, 0, 1)) return 1;
+    for (int64_t l = 0; l < starts->n; ++l) {
+        *iterations += starts->iterations[l];
+        if (!(starts->J[l] < INFINITY)) starts->J[l] = INFINITY;
+    }
+    choose_finalists(starts->J, starts->n, chosen);
+    for (int64_t l = 0; l < FINALISTS(starts->n); ++l) {
+        int64_t from = chosen[l];
+        for (int64_t c = l; c < FINALISTS(starts->n); ++c) /* a later finalist that is here goes to where this one was */
+            if (chosen[c] == l) chosen[c] = from;
+        swap(starts->J + l, starts->J + from, 1);
+        swap(starts->u + l * N * NU, starts->u + from * N * NU, N * NU);
+        swap(starts->x + l * (N + 1) * NX, starts->x + from * (N + 1) * NX, (N + 1) * NX);
+    }
+    return 0;
+}
+
 /* Cold solve of one problem. Each start is the cheapest of its share of the candidates, which keeps them different;
  * the best solution goes to row i of the batch. */
 static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
-                      int64_t n_candidates, double *J, lanes *w, mpc_batch *starts) {
-    int64_t N = m->horizon, best = 0;
-    const double *u0 = b->u0 ? b->u0 + i * NU : NULL;
+                      int64_t n_candidates, double *J, lanes *w, mpc_batch *starts, int64_t *chosen) {
+    int64_t N = m->horizon, best = 0, iterations = 0;
     starts->theta = b->theta + i * b->theta_stride;
-    candidate_costs(m, w, b->x0 + i * NX, starts->theta, u0, candidates, n_candidates, J);
-    for (int64_t l = 0; l < starts->n; ++l) {
-        int64_t cheapest = l * n_candidates / starts->n;
-        for (int64_t c = cheapest; c < (l + 1) * n_candidates / starts->n; ++c)
-            if (J[c] < J[cheapest]) cheapest = c;
-        memcpy(starts->u + l * N * NU, candidates + cheapest * N * NU, N * NU * sizeof(double));
-        memcpy((double *)starts->x0 + l * NX, b->x0 + i * NX, NX * sizeof(double));
-        if (u0) memcpy((double *)starts->u0 + l * NU, u0, NU * sizeof(double));
-    }
-    /* A few iterations show which starts lead somewhere; only the best go on. */
-    mpc_problem race = *m;
-    if (race.max_iterations > RACE_ITERATIONS) race.max_iterations = RACE_ITERATIONS;
-    if (solve_range(&race, starts, 0, 1)) return 1;
-    int64_t iterations = 0;
-    for (int64_t l = 0; l < starts->n; ++l) {
-        iterations += starts->iterations[l];
-        if (!(starts->J[l] < INFINITY)) starts->J[l] = INFINITY;
-    }
+    choose_starts(m, b, i, candidates, n_candidates, J, w, starts);
     mpc_batch finals = *starts;
-    finals.n = FINALISTS(starts->n);
-    finals.cold = 0;
-    for (int64_t l = 0; l < finals.n; ++l) {
-        int64_t lead = l;
-        for (int64_t other = l + 1; other < starts->n; ++other)
-            if (starts->J[other] < starts->J[lead]) lead = other;
-        swap(starts->J + l, starts->J + lead, 1);
-        swap(starts->u + l * N * NU, starts->u + lead * N * NU, N * NU);
-        swap(starts->x + l * (N + 1) * NX, starts->x + lead * (N + 1) * NX, (N + 1) * NX);
+    if (starts->n > 1) {
+        if (race(m, starts, chosen, &iterations)) return 1;
+        finals.n = FINALISTS(starts->n);
+        finals.guess = ROLLOUT;
+        finals.rivals = 1;
     }
     if (solve_range(m, &finals, 0, 1)) return 1;
     for (int64_t l = 0; l < finals.n; ++l) {
         iterations += starts->iterations[l];
         /* A converged solution that is as good as the best goes before one that is not. */
-        double slack = 1e-6 * (1.0 + (starts->J[best] < 0 ? -starts->J[best] : starts->J[best]));
+        double slack = BEATEN * (1.0 + (starts->J[best] < 0 ? -starts->J[best] : starts->J[best]));
         int nearly = starts->J[l] < starts->J[best] + slack;
         int closer = starts->status[l] == CONVERGED && starts->status[best] != CONVERGED && nearly;
         int same = (starts->status[l] == CONVERGED) == (starts->status[best] == CONVERGED);
@@ -214,12 +243,12 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
                    int64_t n_starts, int64_t first, int64_t stride) {
     int64_t N = m->horizon, row = (N + 1) * NX + N * NU + NX + NU + 2;
     double *memory = calloc(n_starts * row + n_candidates, sizeof(double));
-    int64_t *flags = calloc(2 * n_starts, sizeof(int64_t));
+    int64_t *flags = calloc(3 * n_starts, sizeof(int64_t));
     lanes *w = lanes_new(N);
     int failed = !memory || !flags || !w;
     if (!failed) {
         double *q = memory + n_candidates;
-        mpc_batch starts = {.n = n_starts, .cold = 1, .iterations = flags, .status = flags + n_starts};
+        mpc_batch starts = {.n = n_starts, .guess = INPUTS, .iterations = flags, .status = flags + n_starts};
         starts.x = q, starts.x_guess = q; q += n_starts * (N + 1) * NX;
         starts.u = q, starts.u_guess = q; q += n_starts * N * NU;
         starts.x0 = q; q += n_starts * NX;
@@ -227,7 +256,7 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
         starts.J = q; q += n_starts;
         starts.predicted = q;
         for (int64_t i = first; i < b->n && !failed; i += stride)
-            failed = solve_cold(m, b, i, candidates, n_candidates, memory, w, &starts);
+            failed = solve_cold(m, b, i, candidates, n_candidates, memory, w, &starts, flags + 2 * n_starts);
     }
     lanes_free(w);
     free(memory);

@@ -53,9 +53,10 @@ class _Batch(ctypes.Structure):
         ("predicted", c_void_p),
         ("iterations", c_void_p),
         ("status", c_void_p),
-        ("cold", c_int),
+        ("guess", c_int),  # 0, as here: a plan that need not obey the model
         ("x_guess", c_void_p),
         ("u_guess", c_void_p),
+        ("rivals", c_int),
     )
 
 
@@ -67,9 +68,9 @@ class DDPSolver(Solver):
     class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian.
 
     A cold problem is solved from 16 of 64 fixed input sequences, each the cheapest of four that are alike; the best
-    four go on after four iterations, and the best solution is kept. A warm one is solved from its plan, which need not
-    obey the model. Every result is a rollout of the model, so the dynamics hold exactly; ``success`` says that the
-    quadratic model at it promises no further decrease and that the first input has settled.
+    four of different costs go on after three iterations, and the best solution is kept. A warm one is solved from its
+    plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
+    ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
 
     References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 
@@ -122,7 +123,8 @@ class DDPSolver(Solver):
         self._problem = _Problem(
             mpc.horizon, mpc.discount, self._low.ctypes.data, self._high.ctypes.data, max_iterations, tolerance
         )
-        self._candidates = np.ascontiguousarray(candidate_inputs(mpc))
+        compared = n_starts if is_convex(mpc) else N_CANDIDATES  # any start leads to the only minimum
+        self._candidates = np.ascontiguousarray(candidate_inputs(mpc)[:compared])
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
 
