@@ -12,7 +12,7 @@ import uuid
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mpcoffline.errors import FileFormatError, MPCOfflineError
+from mpcoffline.errors import FileFormatError, MPCOfflineError, StorageError
 
 _VERSION = 1
 _DOCUMENT, _ARRAYS = "mpcoffline.json", "arrays.npz"
@@ -58,6 +58,9 @@ def write_archive(
         kind: What it holds, checked by :func:`read_archive`.
         document: JSON-able content.
         arrays: Numpy arrays by name.
+
+    Raises:
+        StorageError: If the disk or the file system refuses, as for a folder that does not exist.
     """
     target = Path(path).resolve()
     buffer = io.BytesIO()
@@ -69,8 +72,11 @@ def write_archive(
             archive.writestr(zipfile.ZipInfo(_DOCUMENT, _EPOCH), text, zipfile.ZIP_DEFLATED)
             archive.writestr(zipfile.ZipInfo(_ARRAYS, _EPOCH), buffer.getvalue(), zipfile.ZIP_DEFLATED)
         os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):  # which names the temporary file
+            raise StorageError.of(path, OSError(error.strerror or str(error))) from error
         raise
 
 
@@ -108,6 +114,19 @@ def read_archive(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], 
             hint="Use the version of mpcoffline that wrote it.",
         )
     return document, arrays
+
+
+def holds(path: str | PathLike[str], kind: str) -> bool:
+    """Whether :func:`read_archive` would read a file as of this kind.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+    """
+    try:
+        read_archive(path, kind)
+    except FileFormatError:
+        return False
+    return True
 
 
 @contextmanager

@@ -145,17 +145,17 @@ def say_file(what: str, path: Path) -> None:
 
 def loaded_policy(path: Path) -> MPCPolicy:
     """The policy in a policy's or learner's file."""
-    from mpcoffline.learner import OfflineMPCLearner
-    from mpcoffline.policy import MPCPolicy
+    from mpcoffline.learner import policy_in
 
-    return OfflineMPCLearner.load(path).policy if _holds(path, "learner") else MPCPolicy.load(path)
+    return policy_in(path)
 
 
 def loaded_learner(path: Path) -> OfflineMPCLearner:
     """The learner in a file; a policy's file is told apart from a damaged one."""
+    from mpcoffline.archive import holds
     from mpcoffline.learner import OfflineMPCLearner
 
-    if _holds(path, "policy"):
+    if holds(path, "policy"):
         raise FileFormatError(
             str(path),
             expected="a learner",
@@ -163,17 +163,6 @@ def loaded_learner(path: Path) -> OfflineMPCLearner:
             hint="Give the learner's file; `mpcoffline learn` writes it beside the policy.",
         )
     return OfflineMPCLearner.load(path)
-
-
-def _holds(path: Path, kind: str) -> bool:
-    """Whether a file is of a kind, intact or not."""
-    from mpcoffline.archive import read_archive
-
-    try:
-        read_archive(path, kind)
-    except FileFormatError:
-        return False
-    return True
 
 
 def made_environment(env_id: str, alpha: float | None, start: Start | None) -> Env[Any, Any]:

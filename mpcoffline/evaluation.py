@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_integers
 from mpcoffline.envs import ControlTask
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
@@ -89,8 +90,7 @@ def evaluate(
             without spec.
         UnknownIdError: For an environment id that is not registered.
     """
-    if n_episodes < 1:
-        raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
+    check_integers(1, n_episodes=n_episodes)
     if not 0.0 < discount <= 1.0:
         raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=str(discount))
     spec = _registered(env) if isinstance(env, str) else env.spec

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.learner import policy_in
 from mpcoffline.mpc import MPC
 from mpcoffline.policy import MPCPolicy
 from mpcoffline.solvers import DDPSolver, starts
@@ -26,7 +27,7 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
     ``test_vectors.txt``, closed loops of the policy on its own model.
 
     Args:
-        policy: The policy, or the file of one.
+        policy: The policy, or the file of one or of a learner.
         folder: Where to write; made if missing. Files of the same names are overwritten.
 
     Returns:
@@ -38,7 +39,7 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
         CompilerError: If there is no working C compiler; the test vectors need one.
     """
     if not isinstance(policy, MPCPolicy):
-        policy = MPCPolicy.load(policy)
+        policy = policy_in(policy)
     mpc = policy.mpc
     if mpc.constraints is not None:
         raise InvalidArgumentError(

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.archive import box_from_json, box_to_json, file_errors, holds, read_archive, write_archive
 from mpcoffline.checkpoint import Checkpoint, History
+from mpcoffline.checks import check_integers
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.fitting import Epoch, Fit
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.checks import check_integers
 from mpcoffline.mpc import MPC
 from mpcoffline.policy import MPCPolicy
 from mpcoffline.presets import PRESETS, LearnerConfig
@@ -136,7 +136,8 @@ class OfflineMPCLearner:
 
         Raises:
             InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
-            InvalidArgumentError: If the checkpoint is of another fit, or the given V_phi of another discount.
+            InvalidArgumentError: If the checkpoint is of another fit, the given V_phi of another discount, or
+                ``dataset`` something else.
             UnknownIdError: For an unknown data set id.
         """
         for _ in self.fitter(
@@ -233,8 +234,8 @@ class OfflineMPCLearner:
             from mpcoffline.datasets import load_dataset
 
             dataset = load_dataset(dataset)
-        space = dataset.observation_space
-        return TransitionTable.from_minari(dataset), space if isinstance(space, spaces.Box) else None
+        table, space = TransitionTable.of(dataset), dataset.observation_space
+        return table, space if isinstance(space, spaces.Box) else None
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz."""
@@ -283,6 +284,16 @@ class OfflineMPCLearner:
         return learner
 
 
+def policy_in(path: str | PathLike[str]) -> MPCPolicy:
+    """The policy in a policy's or a learner's file.
+
+    Raises:
+        FileFormatError: If the file is damaged, foreign or of another version.
+        MPCOfflineError: For a learner that has not learned.
+    """
+    return OfflineMPCLearner.load(path).policy if holds(path, "learner") else MPCPolicy.load(path)
+
+
 class _Progress:
     """A progress bar over the phases of a fit."""
 
@@ -297,7 +308,8 @@ class _Progress:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._bar.stop()
+        if not self._bar.disable:  # rich before 14.3 prints an empty line even so
+            self._bar.stop()
 
     def show(self, epoch: Epoch) -> None:
         """Moves the bar of the epoch's phase."""

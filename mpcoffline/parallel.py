@@ -15,7 +15,8 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
-from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
+from mpcoffline.checks import check_integers
+from mpcoffline.errors import MPCOfflineError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -68,8 +69,8 @@ def map(
         JobError: If a job raises or its process dies; the others are stopped.
     """
     named = dict(jobs) if isinstance(jobs, Mapping) else {str(i): job for i, job in enumerate(jobs)}
-    if workers is not None and workers < 1:
-        raise InvalidArgumentError("workers", expected="a positive integer", actual=str(workers))
+    if workers is not None:
+        check_integers(1, workers=workers)
     n_workers = min(n_cpus() if workers is None else workers, len(named))
     finished = _run_here(fn, named) if n_workers <= 1 else _run_in_processes(fn, named, n_workers)
     results: dict[str, Result] = {}

@@ -8,9 +8,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from mpcoffline.checks import check_integers, check_number
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.learning import FitConfig, ValueConfig
-from mpcoffline.learning.checks import check_integers, check_number
 
 Init = Literal["nominal", "identified"]
 Terminal = Literal["given", "norm", "quadratic", "network"]

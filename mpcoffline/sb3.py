@@ -21,6 +21,7 @@ from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv
 
 from mpcoffline.archive import read_archive
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.learner import OfflineMPCLearner
 from mpcoffline.policy import MPCPolicy
@@ -257,8 +258,7 @@ class EnvironmentEvaluator:
     """
 
     def __init__(self, env: gym.Env[Any, Any] | VecEnv | str, n_episodes: int = 10, *, seed: int = 0) -> None:
-        if n_episodes < 1:
-            raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
+        check_integers(1, n_episodes=n_episodes)
         self._env = MPCModel._wrap_env(maybe_make_env(env, verbose=0))
         self._n_episodes, self._seed = n_episodes, seed
 

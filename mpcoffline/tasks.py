@@ -8,6 +8,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from mpcoffline.checks import check_integers
 from mpcoffline.envs import cartpole_swing_up as cartpole
 from mpcoffline.envs import linear_tracking as linear
 from mpcoffline.envs import pendulum_swing_up as pendulum
@@ -64,7 +65,8 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
 
     Raises:
         UnknownIdError: For an environment that is none of the three.
-        InvalidArgumentError: For an alpha that can make a mass or length non-positive, or an alpha for the linear task.
+        InvalidArgumentError: For an alpha that can make a mass or length non-positive, an alpha for the linear task,
+            or a negative seed.
     """
     builders: dict[str, Callable[[float, int | None], MPC]] = {
         "mpcoffline/LinearTracking-v0": _linear,
@@ -74,6 +76,8 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
     name = env_id.removeprefix("mpcoffline:")
     if name not in builders:
         raise UnknownIdError.of("environment id", env_id, builders)
+    if seed is not None:
+        check_integers(0, seed=seed)
     return builders[name](alpha, seed)
 
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from lq_plant import make_mpc, random_log
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageError
 from mpcoffline.learner import OfflineMPCLearner
 from mpcoffline.policy import MPCPolicy
 
@@ -97,6 +97,13 @@ def test_a_write_that_fails_leaves_the_old_file(
         write_archive(path, "thing", {"text": "new"})
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["x.zip"]
+
+
+def test_a_folder_that_is_missing_is_named_not_a_temporary_file(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "x.zip"
+    with pytest.raises(StorageError, match=r"nowhere/x\.zip: expected to be written, got No such file") as caught:
+        write_archive(path, "thing", DOCUMENT)
+    assert "/." not in str(caught.value)
 
 
 def test_what_json_cannot_say_is_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -7,11 +7,12 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import lq_plant
 import numpy as np
 import pytest
 from mpc_problems import CARTPOLE, LINEAR, PENDULUM, random_linear, random_states
 
-from mpcoffline import MPCPolicy
+from mpcoffline import MPCPolicy, OfflineMPCLearner
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.export import export_c
 from mpcoffline.mpc import MPC, NetworkCost
@@ -133,6 +134,17 @@ def test_a_state_that_overflows_is_said_and_bounded(tmp_path: Path) -> None:
     assert first == "unsolved"
     assert abs(float(action)) <= 2.0
     assert abs(float(second)) < 1e-6  # the next, sound state is solved as if nothing had been
+
+
+def test_a_learners_file_is_taken_as_a_policys(tmp_path: Path) -> None:
+    learner = OfflineMPCLearner(lq_plant.make_mpc(), preset="paper", value_n_steps=1, fit_n_steps=1, hidden=(4,))
+    learner.fit(lq_plant.random_log(50), show_progress=False)
+    learner.save(tmp_path / "learner.zip")
+    learner.policy.save(tmp_path / "policy.zip")
+    for name in ("learner", "policy"):
+        export_c(tmp_path / f"{name}.zip", tmp_path / name)
+    for name in ("mpc_controller.c", "test_vectors.txt"):
+        assert (tmp_path / "learner" / name).read_text() == (tmp_path / "policy" / name).read_text()
 
 
 def test_constraints_are_refused(tmp_path: Path) -> None:

@@ -416,6 +416,12 @@ def untouched(learner: OfflineMPCLearner, data: Any, error: type[Exception], mes
     assert learner.history == history
 
 
+def test_arrays_are_no_data_set() -> None:
+    untouched(
+        fitted(), np.zeros((5, 7)), InvalidArgumentError, r"data set: .* got ndarray\. TransitionTable\.from_arrays"
+    )
+
+
 def test_data_of_another_plant_are_refused() -> None:
     zeros = np.zeros(5)
     learner = fitted()

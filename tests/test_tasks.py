@@ -133,6 +133,12 @@ def test_alphas_just_below_the_limit_are_taken(env_id: str) -> None:
         assert (model_parameters(env_id, 1.99, seed) > 0).all()
 
 
+@pytest.mark.parametrize("seed", [-1, 0.5])
+def test_seeds_that_are_none_are_refused(seed: Any) -> None:
+    with pytest.raises(InvalidArgumentError, match="seed: expected an integer >= 0"):
+        nominal_mpc(PENDULUM, seed=seed)
+
+
 def test_the_linear_task_takes_no_alpha() -> None:
     with pytest.raises(InvalidArgumentError, match=r"alpha: expected none.*gym\.make"):
         nominal_mpc(LINEAR, alpha=0.5)

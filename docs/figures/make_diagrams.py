@@ -195,7 +195,7 @@ MODULES = {
     "tasks": ("tasks",),
     "mpc": ("mpc",),
     "datasets": ("datasets",),
-    "base": ("errors", "archive", "parallel"),
+    "base": ("errors", "checks", "archive", "parallel"),
     "envs": ("envs",),
 }
 _ROWS = (20.0, 118.0, 216.0, 314.0, 412.0, 510.0, 608.0)
@@ -222,13 +222,15 @@ BOXES = {
     "tasks": _box(4, 720, 150, "tasks", "MPC_1 of each task", "control"),
     "mpc": _box(5, 166, 190, "mpc", "what is optimised", "control"),
     "datasets": _box(5, 426, 180, "datasets", "record, store, read", "data"),
-    "base": _box(6, 20, 586, "errors, archive, parallel", "imported by every box but envs: no arrows are drawn", "use"),
+    "base": _box(
+        6, 20, 586, "errors, checks, archive, parallel", "imported by every box but envs: no arrows are drawn", "use"
+    ),
     "envs": _box(6, 630, 330, "envs", "the plants, as Gymnasium environments", "data"),
 }
 #: Where an arrow leaves its box, where it enters the other, and how far above that box it runs across.
 ROUTES: dict[tuple[str, str], tuple[float, float, float]] = {
     ("cli", "doctor"): (67, 67, 18), ("cli", "export"): (171, 171, 18), ("cli", "diagnostics"): (506, 506, 18),
-    ("cli", "study"): (793, 793, 18), ("export", "policy"): (171, 210, 18), ("sb3", "learner"): (311, 420, 18),
+    ("cli", "study"): (793, 793, 18), ("export", "learner"): (171, 400, 11), ("sb3", "learner"): (311, 420, 18),
     ("diagnostics", "learner"): (491, 491, 18), ("diagnostics", "plotting"): (560, 665, 18),
     ("study", "learner"): (650, 560, 11), ("study", "plotting"): (715, 715, 18), ("study", "tasks"): (795, 795, 18),
     ("study", "evaluation"): (895, 895, 18), ("learner", "policy"): (420, 310, 18),

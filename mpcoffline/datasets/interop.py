@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.errors import InvalidArgumentError
 
+from .minari_store import load_dataset
 from .transitions import TransitionTable
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def to_dict(data: Data) -> dict[str, NDArray[Any]]:
         ``next_observations (n, ny)``, all float32; ``terminals (n,)`` and ``timeouts (n,)``, boolean: whether an
         episode terminated there, or ended without; ``episode_ids (n,)``, int64. All are copies.
     """
-    table = _table(data)
+    table = TransitionTable.of(data)
     costs = table.costs.copy()
     return {
         "observations": table.observations.copy(),
@@ -76,12 +77,12 @@ def to_sb3_replay_buffer(
     """
     from stable_baselines3.common.buffers import ReplayBuffer
 
+    if isinstance(data, str):
+        data = load_dataset(data)
+    table = TransitionTable.of(data)
     if not isinstance(data, TransitionTable):
-        dataset = _dataset(data)
-        observation_space = observation_space or dataset.observation_space
-        action_space = action_space or dataset.action_space
-        data = dataset
-    table = _table(data)
+        observation_space = observation_space or data.observation_space
+        action_space = action_space or data.action_space
     for name, space, size in (
         ("observation_space", observation_space, table.ny),
         ("action_space", action_space, table.nu),
@@ -138,7 +139,7 @@ def to_torchrl(data: Data) -> Any:
     def tensor(array: NDArray[Any]) -> torch.Tensor:
         return torch.from_numpy(np.array(array))
 
-    table = _table(data)
+    table = TransitionTable.of(data)
     terminated = tensor(table.terminations[:, None] > 0.0)
     truncated = tensor(_timeouts(table)[:, None])
     never = torch.zeros_like(terminated)
@@ -183,7 +184,7 @@ def to_d3rlpy(data: Data) -> Any:
         raise _missing("d3rlpy", hint, error) from error
     from .interop_d3rlpy import LastTransitionPicker, WholeEpisode
 
-    table = _table(data)
+    table = TransitionTable.of(data)
     ends = np.flatnonzero((table.terminations > 0.0) | _timeouts(table)) + 1
     starts = np.concatenate([[0], ends[:-1]])
     episodes = [
@@ -197,18 +198,6 @@ def to_d3rlpy(data: Data) -> Any:
         for start, end in zip(starts, ends, strict=True)
     ]
     return create_infinite_replay_buffer(episodes=episodes, transition_picker=LastTransitionPicker())
-
-
-def _table(data: Data) -> TransitionTable:
-    return data if isinstance(data, TransitionTable) else TransitionTable.from_minari(_dataset(data))
-
-
-def _dataset(data: MinariDataset | str) -> MinariDataset:
-    if isinstance(data, str):
-        from .minari_store import load_dataset
-
-        return load_dataset(data)
-    return data
 
 
 def _timeouts(table: TransitionTable) -> NDArray[np.bool_]:

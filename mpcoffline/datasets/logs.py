@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
 from .checks import floats
@@ -65,8 +66,7 @@ def record(
             outside the action space; the episodes before are kept then.
         StorageError: Where the disk refuses; the episodes before are kept.
     """
-    if n_episodes < 1:
-        raise InvalidArgumentError("n_episodes", expected="an integer >= 1", actual=str(n_episodes))
+    check_integers(1, n_episodes=n_episodes)
     made = gym.make(env) if isinstance(env, str) else env
     recording = Recording(
         dataset_id,

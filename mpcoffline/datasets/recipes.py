@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
 TASKS = ("linear", "pendulum", "cartpole")
@@ -136,12 +137,10 @@ class Recipe:
         if alpha is not None and alpha != self.alpha:
             suffix += self._alpha_suffix(alpha, explicit=dataset_id is not None)
         if seed is not None and seed != self.seed:
-            if seed < 0:
-                raise InvalidArgumentError("seed", expected="an integer >= 0", actual=str(seed))
+            check_integers(0, seed=seed)
             suffix += f"-seed{seed}"
         if steps is not None and steps != self.steps:
-            if steps < 1:
-                raise InvalidArgumentError("steps", expected="an integer >= 1", actual=str(steps))
+            check_integers(1, steps=steps)
             suffix += f"-steps{steps}"
         name, version = self.dataset_id.rsplit("-v", 1)
         return replace(

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 
 from .episodes import EpisodeBuilder
@@ -85,8 +86,7 @@ class MinariRecorder(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         check_new_dataset(dataset_id, overwrite=overwrite)
-        if not sync_episodes >= 1:
-            raise InvalidArgumentError("sync_episodes", expected="an integer >= 1", actual=str(sync_episodes))
+        check_integers(1, sync_episodes=sync_episodes)
         self.dataset_id = dataset_id
         self.overwrite = overwrite
         self.algorithm_name = algorithm_name

@@ -13,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
+from mpcoffline.checks import check_integers
 from mpcoffline.envs import ControlTask
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
 
@@ -159,8 +160,8 @@ def replay(
             noise.
         InvalidArgumentError: For ``n_episodes`` < 1 or an unknown quantity.
     """
-    if n_episodes is not None and n_episodes < 1:
-        raise InvalidArgumentError("n_episodes", expected="an integer >= 1", actual=str(n_episodes))
+    if n_episodes is not None:
+        check_integers(1, n_episodes=n_episodes)
     unknown = set(tolerances or {}) - set(QUANTITIES)
     if unknown:
         raise InvalidArgumentError("tolerances", expected=f"names out of {QUANTITIES}", actual=str(sorted(unknown)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
 from .checks import check_finite, checked_episode_ids, floats, place
@@ -176,6 +177,20 @@ class TransitionTable:
         table = cls(rows, s.shape[1], a.shape[1], np.zeros(len(s), dtype=np.int64), name)
         table.episode_ids = table._episodes_by_continuity() if ids is None else ids
         return table
+
+    @classmethod
+    def of(cls, data: TransitionTable | MinariDataset | str) -> TransitionTable:
+        """A table as it is; a Minari data set, or the id of one, by :meth:`from_minari`.
+
+        Raises:
+            InvalidArgumentError: For anything else.
+        """
+        if isinstance(data, TransitionTable):
+            return data
+        if not isinstance(data, str) and not hasattr(data, "iterate_episodes"):
+            expected, hint = "a table, a Minari data set or its id", "TransitionTable.from_arrays takes arrays."
+            raise InvalidArgumentError("data set", expected=expected, actual=type(data).__name__, hint=hint)
+        return cls.from_minari(data)
 
     @classmethod
     def from_minari(
@@ -349,8 +364,7 @@ class TransitionTable:
         Raises:
             InvalidArgumentError: For a batch size below 1.
         """
-        if batch_size < 1:
-            raise InvalidArgumentError("batch_size", expected="an integer >= 1", actual=str(batch_size))
+        check_integers(1, batch_size=batch_size)
         batch_size, generator = min(batch_size, len(self)), np.random.default_rng(rng)
         if self._file is None:
             return gather_batches(self.rows, batch_size, generator, epochs)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_integers
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import MPCOfflineError
 from mpcoffline.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
-from mpcoffline.learning.checks import check_integers
 from mpcoffline.learning.smoothing import SmoothedIdentification, identify_smoothed
 from mpcoffline.mpc import MPC
 from mpcoffline.policy import MPCPolicy
@@ -86,7 +86,7 @@ def diagnose(
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
-    table = _table_of(dataset)
+    table = TransitionTable.of(dataset)
     found = identify_smoothed(nominal, table, seed=seed)
     clean, identified = found.table, nominal.with_theta(found.identification.theta)
     ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
@@ -183,7 +183,3 @@ def _notes(report: Report) -> tuple[str, ...]:
                 f"{weight.name} has lost a direction (smallest eigenvalue 0): raise the prior if that one matters."
             )
     return tuple(notes)
-
-
-def _table_of(dataset: MinariDataset | TransitionTable | str) -> TransitionTable:
-    return dataset if isinstance(dataset, TransitionTable) else TransitionTable.from_minari(dataset)

@@ -14,10 +14,10 @@ import scipy.optimize
 import torch
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_integers, check_number
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .checks import check_integers, check_number
 from .coordinates import Coordinates
 from .one_step import OneStep
 

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_integers, check_number
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .bellman import BellmanFit, PredictionError
-from .checks import check_integers, check_number
 from .coordinates import Coordinates, canonical
 from .potential import Potential
 from .progress import Metrics, Report, silent

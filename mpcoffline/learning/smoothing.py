@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_number
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
-from .checks import check_number
 from .identification import Identification, IdentificationConfig, OneStepProblem, described, identify
 from .kalman import Filtered, Linearised, filtered, smoothed
 from .trajectories import Trajectories

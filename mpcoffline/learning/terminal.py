@@ -17,11 +17,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from mpcoffline.checks import check_integers, check_number
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
 from mpcoffline.mpc import NetworkCost, QuadraticCost, TerminalCost
 from mpcoffline.mpc.networks import HIDDEN
 
-from .checks import check_integers, check_number
 from .distillation import fit_network
 
 Array = NDArray[np.float64]

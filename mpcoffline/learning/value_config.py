@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mpcoffline.checks import check_integers, check_number
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
-from .checks import check_integers, check_number
 from .value_methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
 
 VALUE_METHODS = ("residual", "td", "expectile", "iql", "auto")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.errors import InvalidArgumentError
 
-from .parameters import Array, Block, ParameterSpace
+from .parameters import Array, Block, Parameter, ParameterSpace
 
 
 class Component:
@@ -92,13 +92,26 @@ def difference(name: str, variable: ca.SX, reference: ca.SX) -> ca.SX:
     return variable - reference
 
 
+def numbers(name: str, given: object) -> Array:
+    """The numbers given, as float64.
+
+    Raises:
+        InvalidArgumentError: For anything else, as a :class:`Parameter`, which only a model takes.
+    """
+    try:
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        hint = "Only a Model's parameters have bounds and units." if isinstance(given, Parameter) else ""
+        raise InvalidArgumentError(name, expected="a number or numbers", actual=repr(given), hint=hint) from error
+
+
 def vector(name: str, given: ArrayLike | None, size: int, default: float = 0.0) -> Array:
     """The numbers given ``(size,)``, or all ``default``.
 
     Raises:
-        InvalidArgumentError: For another shape.
+        InvalidArgumentError: For another shape, or what is no number.
     """
-    numbers = np.full(size, default) if given is None else np.atleast_1d(np.asarray(given, dtype=np.float64))
-    if numbers.shape != (size,):
-        raise InvalidArgumentError(name, expected=f"shape ({size},)", actual=f"shape {numbers.shape}")
-    return numbers
+    found = np.full(size, default) if given is None else np.atleast_1d(numbers(name, given))
+    if found.shape != (size,):
+        raise InvalidArgumentError(name, expected=f"shape ({size},)", actual=f"shape {found.shape}")
+    return found

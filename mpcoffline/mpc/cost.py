@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
-from .component import Component, blocks_from_json, difference, vector
+from .component import Component, blocks_from_json, difference, numbers, vector
 from .parameters import Array, Block, ParameterSpace
 
 
@@ -49,7 +49,7 @@ class QuadraticCost(Component):
         u_ref: ArrayLike | None = None,
         constant: float = 0.0,
     ) -> None:
-        weight = np.atleast_2d(np.asarray(W, dtype=np.float64))
+        weight = np.atleast_2d(numbers("W", W))
         nx = weight.shape[0]
         blocks: list[Block] = []
         nu = 0
@@ -58,12 +58,15 @@ class QuadraticCost(Component):
                 raise InvalidArgumentError("R", expected="a matrix, as S or u_ref is given", actual="None")
             blocks.append(Block.psd("W", weight, "cost"))
         else:
-            input_weight = np.atleast_2d(np.asarray(R, dtype=np.float64))
+            input_weight = np.atleast_2d(numbers("R", R))
             nu = input_weight.shape[0]
             blocks += _weight_blocks(weight, input_weight, S)
             blocks.append(Block.free("u_ref", vector("u_ref", u_ref, nu), "reference"))
         blocks.append(Block.free("x_ref", vector("x_ref", x_ref, nx), "reference"))
-        blocks.append(Block.free("constant", float(constant), "cost"))
+        offset = numbers("constant", constant)
+        if offset.ndim > 0:
+            raise InvalidArgumentError("constant", expected="one number", actual=f"shape {offset.shape}")
+        blocks.append(Block.free("constant", offset, "cost"))
         self.nx, self.nu = nx, nu
         self.space = ParameterSpace(blocks)
 
@@ -144,7 +147,7 @@ class NormCost(Component):
     def __init__(self, x_ref: ArrayLike, eps: float = 0.1) -> None:
         if not (np.isfinite(eps) and eps > 0.0):
             raise InvalidArgumentError("eps", expected="a positive number", actual=str(eps))
-        reference = np.atleast_1d(np.asarray(x_ref, dtype=np.float64))
+        reference = np.atleast_1d(numbers("x_ref", x_ref))
         self.nx, self.eps = len(reference), float(eps)
         self.space = ParameterSpace([Block.free("x_ref", reference, "reference")])
 
@@ -186,7 +189,7 @@ def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:
     """W and R as blocks of their own, or one block H when there is a cross term."""
     if S is None:
         return [Block.psd("W", W, "cost"), Block.psd("R", R, "cost")]
-    cross = np.asarray(S, dtype=np.float64)
+    cross = numbers("S", S)
     if cross.shape != (len(W), len(R)):
         raise InvalidArgumentError("S", expected=f"shape {(len(W), len(R))}", actual=f"shape {cross.shape}")
     for name, matrix in (("W", W), ("R", R)):

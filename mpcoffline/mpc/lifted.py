@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 
 from .component import vector
@@ -121,8 +122,7 @@ def polynomial_features(nx: int, degree: int = 2) -> Features:
     Raises:
         InvalidArgumentError: For a degree below 1.
     """
-    if degree < 1:
-        raise InvalidArgumentError("degree", expected="a positive integer", actual=str(degree))
+    check_integers(1, degree=degree)
     products = [
         chosen for d in range(1, degree + 1) for chosen in itertools.combinations_with_replacement(range(nx), d)
     ]

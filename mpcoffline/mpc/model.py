@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import Component, blocks_from_json
@@ -52,9 +53,7 @@ class Model(Component):
         *,
         discrete: bool = False,
     ) -> None:
-        for name, value in (("nx", nx), ("nu", nu)):
-            if value < 1:
-                raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
+        check_integers(1, nx=nx, nu=nu)
         if not (np.isfinite(dt) and dt > 0.0):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
         self.nx, self.nu, self.dt = int(nx), int(nu), float(dt)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any, Literal, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import StageCost, TerminalCost
@@ -59,11 +60,12 @@ class MPC:
     constraints: Constraints | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        horizon, discount = _positive_integer("horizon", self.horizon), _discount(self.discount)
+        check_integers(1, horizon=self.horizon)
+        discount = _discount(self.discount)
         low, high = (self._bounds(name) for name in ("action_low", "action_high"))
         if not (low < high).all():
             raise InvalidArgumentError("action_low", expected=f"values below action_high = {high}", actual=str(low))
-        object.__setattr__(self, "horizon", horizon)
+        object.__setattr__(self, "horizon", int(self.horizon))
         object.__setattr__(self, "discount", discount)
         object.__setattr__(self, "action_low", low)
         object.__setattr__(self, "action_high", high)
@@ -259,12 +261,6 @@ class MPC:
 
 def _sizes(model: Model) -> Sizes:
     return Sizes(model.nx, model.nu, model.space)
-
-
-def _positive_integer(name: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
-        raise InvalidArgumentError(name, expected="a positive integer", actual=repr(value))
-    return int(value)
 
 
 def _discount(value: object) -> float:

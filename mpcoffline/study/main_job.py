@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from mpcoffline.checks import check_integers
 from mpcoffline.datasets import TransitionTable, load_dataset
-from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.evaluation import Evaluation, evaluate
 from mpcoffline.learner import Learn, OfflineMPCLearner
 from mpcoffline.mpc import MPC
@@ -72,8 +72,7 @@ def run_task(
         InvalidArgumentError: For a number out of range.
         InvalidDataError: For a data set that does not fit the task.
     """
-    if n_episodes < 1:
-        raise InvalidArgumentError("n_episodes", expected="a positive integer", actual=str(n_episodes))
+    check_integers(1, n_episodes=n_episodes)
     setup = setup_of(task, alpha, seed)
     data = load_dataset(dataset or setup.dataset_id)
     options: dict[str, Any] = {"preset": "paper", "seed": seed, "value": value} | learner_options

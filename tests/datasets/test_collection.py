@@ -100,7 +100,7 @@ def test_ids_say_what_deviates_from_the_recipe() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"steps": 0}, "steps: expected an integer >= 1, got 0"),
+        ({"steps": 0}, "steps: expected a positive integer, got 0"),
         ({"seed": -1}, "seed: expected an integer >= 0, got -1"),
         ({"dataset_id": "no.dots-v0"}, r"namespace/"),
         ({"alpha": 1.0}, "alpha: expected no alpha"),

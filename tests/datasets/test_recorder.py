@@ -280,5 +280,5 @@ def test_what_a_failed_training_recorded_can_be_sealed() -> None:
 
 
 def test_the_number_of_episodes_between_synchronisations_is_checked() -> None:
-    with pytest.raises(InvalidArgumentError, match="sync_episodes: expected an integer >= 1, got 0"):
+    with pytest.raises(InvalidArgumentError, match="sync_episodes: expected a positive integer, got 0"):
         MinariRecorder("mpcoffline/test/sync-v0", sync_episodes=0)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.mpc import NormCost, QuadraticCost
+from mpcoffline.mpc import NormCost, Parameter, QuadraticCost
 from mpcoffline.mpc.cost import cost_from_json
 
 Array = NDArray[np.float64]
@@ -91,6 +91,11 @@ def test_parameters_and_their_groups() -> None:
         ({"W": [[np.nan]]}, "W: expected finite entries"),
         ({"W": np.eye(2), "x_ref": [0.0, np.nan]}, "finite numbers"),
         ({"W": np.eye(2), "constant": np.inf}, "finite numbers"),
+        ({"W": np.eye(2), "constant": Parameter(1.0)}, "constant: expected a number or numbers, got Parameter.*Model"),
+        ({"W": np.eye(2), "constant": [1.0, 2.0]}, "constant: expected one number, got shape"),
+        ({"W": Parameter(np.eye(2))}, "W: expected a number or numbers, got Parameter"),
+        ({"W": np.eye(2), "R": "heavy"}, "R: expected a number or numbers, got 'heavy'"),
+        ({"W": np.eye(2), "x_ref": {}}, "x_ref: expected a number or numbers"),
     ],
 )
 def test_quadratic_cost_refuses(arguments: dict[str, Any], message: str) -> None:

@@ -1,4 +1,4 @@
-"""What the configurations refuse."""
+"""What arguments and configurations refuse."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ def check_integers(low: int, **values: object) -> None:
     """
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < low:
-            raise InvalidArgumentError(name, expected=f"an integer >= {low}", actual=repr(value))
+            expected = "a positive integer" if low == 1 else f"an integer >= {low}"
+            raise InvalidArgumentError(name, expected=expected, actual=repr(value))
 
 
 def check_number(name: str, value: object, low: float, high: float = math.inf, *, open_low: bool = True) -> None:
