@@ -85,7 +85,8 @@ nb_merge_streams = True
 
 # What the notebooks' processes inherit: one thread, and a store of data sets that is not the user's.
 os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1", MPLBACKEND="agg", SDL_VIDEODRIVER="dummy")
-os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp(prefix="mpcoffline-docs-")
+_STORE = tempfile.TemporaryDirectory(prefix="mpcoffline-docs-")  # removed when the build ends
+os.environ["MINARI_DATASETS_PATH"] = _STORE.name
 
 # --- Pages ----------------------------------------------------------------------------------------------------------
 
