@@ -35,10 +35,12 @@ class Plan(NamedTuple):
     @property
     def known(self) -> NDArray[np.bool_]:
         """Which rows hold a plan, ``(B,)``."""
+        if not len(self.u):
+            return np.zeros(0, dtype=bool)
         # Zero times NaN or inf is NaN: one product a row, several times faster than looking at each number.
         with np.errstate(invalid="ignore"):
-            sums = [a.reshape(len(a), -1) @ np.zeros(a[0].size) for a in self] if len(self.u) else [np.zeros(0)]
-        return np.asarray(np.sum(sums, axis=0) == 0.0)
+            x, u = (a.reshape(len(a), -1) @ np.zeros(a[0].size) for a in self)
+            return np.asarray(x + u == 0.0)
 
     def shifted(self) -> Plan:
         """The plan one step later, its last input held."""

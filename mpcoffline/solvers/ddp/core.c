@@ -159,6 +159,10 @@ static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high
             d[0] = trial[0];
             break;
         }
+        if (!pass && !vl_any(any_bound | clipped | ~definite)) { /* the minimum without bounds, in all lanes */
+            for (int i = 0; i < NU; ++i) d[i] = trial[i];
+            break;
+        }
         /* Halve the step, along its projection, until q falls enough. */
         vd t = V(1.0), expected = V(0.0), change = V(0.0);
         for (int halving = 0; halving < 12; ++halving) {

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -165,39 +167,23 @@ class DDPSolver(Solver):
     def _run(self, x: Array, theta: Array, u0: Array | None, plan: Plan | None) -> dict[str, NDArray[Any]]:
         """Calls the kernel; warm with a plan, cold without."""
         n, mpc = len(x), self.mpc
-        shapes = {
-            "x": (n, mpc.horizon + 1, mpc.nx),
-            "u": (n, mpc.horizon, mpc.nu),
-            "J": (n,),
-            "predicted": (n,),
-            "x0": (n, mpc.nx),
-            "u0": (n, mpc.nu),
-        }
-        block, address = _block(shapes)
+        block, address = _block(n, mpc.horizon, mpc.nx, mpc.nu)
         block["x0"][:] = x
         theta = np.ascontiguousarray(theta)  # one for all, or a row a problem
         if u0 is None:
             address["u0"] = None
         else:
             block["u0"][:] = u0
-        guess = (block["x"], block["u"]) if plan is None else [np.ascontiguousarray(a, np.float64) for a in plan]
-        counts = np.empty((2, n), np.int64)
-        where = counts.ctypes.data
-        batch = _Batch(
-            n=n,
-            theta=theta.ctypes.data,
-            theta_stride=theta.shape[1] if theta.ndim == 2 else 0,
-            iterations=where,
-            status=where + counts.strides[0],
-            x_guess=guess[0].ctypes.data,
-            u_guess=guess[1].ctypes.data,
-            **address,
-        )
+        guess: dict[str, int | None] = {"x_guess": address["x"], "u_guess": address["u"]}
+        if plan is not None:
+            kept = [np.ascontiguousarray(a, np.float64) for a in plan]  # as long as the kernel reads them
+            guess = {"x_guess": kept[0].ctypes.data, "u_guess": kept[1].ctypes.data}
+        stride = theta.shape[1] if theta.ndim == 2 else 0
+        batch = _Batch(n=n, theta=theta.ctypes.data, theta_stride=stride, **guess, **address)
         failed = self._call(batch, cold=plan is None)
         if failed:
             raise MemoryError(f"solving {n} MPCs: the kernel could not allocate its work space")
-        result: dict[str, NDArray[Any]] = {name: block[name] for name in ("x", "u", "J", "predicted")}
-        return result | {"iterations": counts[0], "status": counts[1]}
+        return {name: block[name] for name in ("x", "u", "J", "predicted", "iterations", "status")}
 
     def _call(self, batch: _Batch, *, cold: bool) -> int:
         """Runs the kernel on a batch, in several threads if there are; returns how many failed."""
@@ -221,16 +207,34 @@ def _rows(theta: Array, chosen: NDArray[np.bool_]) -> Array:
     return theta[chosen] if theta.ndim == 2 else theta
 
 
-def _block(shapes: dict[str, tuple[int, ...]]) -> tuple[dict[str, Array], dict[str, int | None]]:
-    """Arrays of doubles in one piece of memory, and their addresses: for one problem, allocations would take long."""
-    sizes = [math.prod(shape) for shape in shapes.values()]
-    memory = np.empty(sum(sizes))
+@functools.lru_cache(maxsize=64)
+def _layout(n: int, horizon: int, nx: int, nu: int) -> tuple[tuple[tuple[str, slice, tuple[int, ...]], ...], int]:
+    """Name, place and shape of the arrays of n problems in one piece of memory, and its size in numbers of 8 bytes."""
+    shapes = {
+        "x": (n, horizon + 1, nx),
+        "u": (n, horizon, nu),
+        "J": (n,),
+        "predicted": (n,),
+        "x0": (n, nx),
+        "u0": (n, nu),
+        "iterations": (n,),
+        "status": (n,),
+    }
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()]).tolist()
+    places = (slice(start, end) for start, end in pairwise([0, *ends]))
+    return tuple((name, place, shape) for (name, shape), place in zip(shapes.items(), places, strict=True)), ends[-1]
+
+
+def _block(n: int, horizon: int, nx: int, nu: int) -> tuple[dict[str, NDArray[Any]], dict[str, int | None]]:
+    """Arrays in one piece of memory, and their addresses: for one problem, allocations would take long."""
+    layout, size = _layout(n, horizon, nx, nu)
+    memory = np.empty(size)
+    integers = memory.view(np.int64)
     start = memory.ctypes.data
-    arrays: dict[str, Array] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     addresses: dict[str, int | None] = {}
-    offset = 0
-    for (name, shape), size in zip(shapes.items(), sizes, strict=True):
-        arrays[name] = memory[offset : offset + size].reshape(shape)
-        addresses[name] = start + 8 * offset
-        offset += size
+    for name, place, shape in layout:
+        whole = integers if name in ("iterations", "status") else memory
+        arrays[name] = whole[place].reshape(shape)
+        addresses[name] = start + 8 * place.start
     return arrays, addresses
