@@ -50,6 +50,24 @@ def check(solver: DDPSolver, x: np.ndarray, solution: Solution, theta: np.ndarra
 # ---------------------------------------------------------------- numbers
 
 
+@pytest.mark.parametrize("env_id", [PENDULUM, CARTPOLE])
+def test_iterations_do_not_creep_and_end_at_the_minimum(env_id: str) -> None:
+    """First inputs against those that many more iterations give; the count includes those of all starts."""
+    mpc = nominal_mpc(env_id)
+    solver, exact = solver_of(env_id), DDPSolver(mpc, tolerance=1e-17, max_iterations=400)
+    iterations, errors = [], []
+    for seed in range(20):
+        theta, x = random_theta(mpc, 300 + seed), random_states(env_id, 4, 300 + seed)
+        found = solver.solve(x, theta)
+        polished = exact.solve(x, theta, warm_start=found)
+        same = np.abs(found.value - polished.value) <= 1e-6 * (1.0 + np.abs(found.value))
+        errors.extend(np.abs(found.u0 - polished.u0)[same].max(axis=1))
+        iterations.extend(found.stats["iterations"])
+    assert len(errors) >= 78
+    assert np.mean(np.array(errors) < 1e-4) >= 0.99
+    assert np.mean(iterations) < 90
+
+
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_solutions_of_random_problems_are_solutions(env_id: str) -> None:
     """Full horizons, random theta with full weights: re-simulated states and cost, bounds, gradient."""
