@@ -103,20 +103,22 @@ class LearnerConfig:
 # Half of the terminal cost is a convex quadratic: a network alone has local minima, to which short plans fall.
 _DEFAULT = LearnerConfig(
     least_discount=0.95,
-    horizon=20,
+    horizon=30,
     terminal="network",
     terminal_blend=0.5,
     init="identified",
     value=ValueConfig(method="auto", tau=0.1, n_steps=3_000, learning_rate=2e-3, polyak=0.02),
-    fit=FitConfig(n_steps=0),
+    # Few steps: they adapt a model that cannot become the plant to what (FIT) needs of it, and hardly move a right one.
+    fit=FitConfig(n_steps=200, prediction_weight=0.1),
 )
 
 PRESETS: dict[str, LearnerConfig] = {
     # The published recipe: (VALUE) by Bellman residual, then (FIT); discount, horizon and terminal cost are the MPC's.
     "paper": LearnerConfig(),
-    # What most users should get: the model by identification, the stage cost by (FIT), the terminal cost from V.
+    # What most users should get: the model by identification, then model and stage cost by (FIT) with the prediction
+    # error beside, the terminal cost from V.
     "default": _DEFAULT,
-    # The same at half the horizon, which leaves more to the terminal cost: it has to be closer to V.
+    # The same at a third of the horizon, which leaves more to the terminal cost: it has to be closer to V.
     "fast": replace(_DEFAULT, horizon=10, terminal_blend=0.25),
     # The same at the long horizon.
     "best": replace(_DEFAULT, horizon=50),
