@@ -15,19 +15,22 @@ from .pendulum_swing_up import PendulumSwingUpEnv
 
 __all__ = ["ENV_IDS", "CartPoleSwingUpEnv", "ControlTask", "LinearTrackingEnv", "PendulumSwingUpEnv"]
 
+# One line a task. Strings: Minari stores the spec as JSON and could not rebuild an environment from a class.
+_TASKS = {
+    "mpcoffline/LinearTracking-v0": "linear_tracking:LinearTracking",
+    "mpcoffline/PendulumSwingUp-v0": "pendulum_swing_up:PendulumSwingUp",
+    "mpcoffline/CartPoleSwingUp-v0": "cartpole_swing_up:CartPoleSwingUp",
+}
+#: The tasks with a nominal controller, labels in figures and a shipped data set.
 ENV_IDS = ("mpcoffline/LinearTracking-v0", "mpcoffline/PendulumSwingUp-v0", "mpcoffline/CartPoleSwingUp-v0")
 
 _MAX_EPISODE_STEPS = 100
-_MODULES = ("linear_tracking", "pendulum_swing_up", "cartpole_swing_up")
 
-# Entry points are strings: Minari stores the spec as JSON and could not rebuild an environment from a class.
-for _id, _module, _class in zip(
-    ENV_IDS, _MODULES, (LinearTrackingEnv, PendulumSwingUpEnv, CartPoleSwingUpEnv), strict=True
-):
+for _id, _name in _TASKS.items():
     if _id not in gym.registry:
         gym.register(
             _id,
-            entry_point=f"mpcoffline.envs.{_module}:{_class.__name__}",
-            vector_entry_point=f"mpcoffline.envs.{_module}:{_class.__name__.removesuffix('Env')}VectorEnv",
+            entry_point=f"mpcoffline.envs.{_name}Env",
+            vector_entry_point=f"mpcoffline.envs.{_name}VectorEnv",
             max_episode_steps=_MAX_EPISODE_STEPS,
         )

@@ -46,7 +46,7 @@ class LinearTrackingEnv(ControlTask):
 
     $$s_+ = A s + B a, \qquad A = A_0 + \alpha\,\Delta_A, \quad B = B_0 + \alpha\,\Delta_B$$
 
-    sampled every $dt = 0.1$ s. From about $\alpha = 0.2$ on the plant is unstable.
+    sampled every $dt = 0.1$ s. For any $\alpha > 0$ the plant is unstable.
 
     ## Action Space
     `Box(-10.0, 10.0, (2,), float32)`. An action beyond the bounds is clipped to them.

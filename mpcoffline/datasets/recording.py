@@ -159,7 +159,7 @@ class Recording:
                 mode,
                 str(serialize_space(observation_space)),
                 str(serialize_space(action_space)),
-                None if env_spec is None else env_spec.to_json(),
+                _spec_json(env_spec),
                 algorithm_name,
                 description,
             )
@@ -296,3 +296,18 @@ def _continued(indices: list[LogIndex], header: LogHeader) -> LogHeader:
 def _remove_logs(dataset_id: str) -> None:
     for path in log_files(dataset_id):
         path.unlink()
+
+
+def _spec_json(spec: EnvSpec | None) -> str | None:
+    """The spec as it is stored."""
+    if spec is None:
+        return None
+    try:
+        return spec.to_json()
+    except ValueError as error:
+        raise InvalidArgumentError(
+            f"environment {spec.id!r}",
+            expected="a spec that can be stored as JSON",
+            actual=str(error),
+            hint='Register it with entry_point="module:Class" instead of the class itself.',
+        ) from error

@@ -99,7 +99,7 @@ class ReplayReport:
         return f"{self.dataset_id} in {self.env_id}: {verdict} ({self.episodes} episodes, {self.steps} steps{skipped})"
 
     def __str__(self) -> str:
-        rows = [f"{name}: {' | '.join(cells)}" for name, *cells in self._rows()]
+        rows = [f"{name}: whole episode {a}, one step {b}, tolerance {c}" for name, a, b, c in self._rows()]
         return "\n".join([self.headline, *rows, *self._remarks()])
 
     def __rich__(self) -> RenderableType:

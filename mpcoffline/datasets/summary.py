@@ -63,7 +63,7 @@ class Summary:
     figure: Path | None
 
     def __str__(self) -> str:
-        facts = [f"{key}: {value}" for key, value in self.facts.items()]
+        facts = [f"* {key}: {value}" for key, value in self.facts.items()]
         rows = [_HEADER, ("---",) * len(_HEADER), *self._rows()]
         table = ["| " + " | ".join(row) + " |" for row in rows]
         lines = [self.card or f"# {self.dataset_id}\n", *facts, "", *table]

@@ -196,3 +196,14 @@ def test_arguments_that_are_refused(log: Path) -> None:
         from_csv(log, **COLUMNS, cost=lambda s, a: a)
     with pytest.raises(InvalidDataError, match=r"line 6: cost\(s, a\): .* got inf"):
         from_csv(log, **COLUMNS, cost=lambda s, a: np.where(s[:, 0] > 4, np.inf, 0.0))
+
+
+def test_an_environment_that_cannot_be_named_in_json_is_refused() -> None:
+    spec = gym.spec(PENDULUM)
+    entry = gym.make(PENDULUM).unwrapped.__class__
+    gym.register("ByClass-v0", entry_point=entry, max_episode_steps=spec.max_episode_steps)
+    try:
+        with pytest.raises(InvalidArgumentError, match="module:Class"):
+            record(gym.make("ByClass-v0"), Proportional(), 1, "test/by-class-v0", seed=0)
+    finally:
+        del gym.registry["ByClass-v0"]
