@@ -16,6 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import SOLVERS, Plan, Solution, Solver, make_solver
@@ -72,7 +73,7 @@ class MPCPolicy(BasePolicy):
         solver_stats: Counts since construction.
 
     Raises:
-        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, or a negative noise.
+        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, or a negative noise or seed.
         UnknownIdError: For an unknown solver.
     """
 
@@ -129,8 +130,12 @@ class MPCPolicy(BasePolicy):
 
         Args:
             seed: The same seed gives the same noise.
+
+        Raises:
+            InvalidArgumentError: For a negative seed.
         """
-        self._noise_generator = np.random.default_rng(seed)
+        check_integers(0, seed=seed)
+        self._seed, self._noise_generator = int(seed), np.random.default_rng(seed)
 
     def with_normalization(self, vec_env: VecEnv | None) -> Self:
         """The policy for the observations that an environment under ``VecNormalize`` gives.
@@ -311,7 +316,7 @@ class MPCPolicy(BasePolicy):
         return np.where(success[:, None], solution.u0, previous), plan
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the policy to a zip of JSON (no pickle)."""
+        """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed."""
         observation_space = self.observation_space
         assert isinstance(observation_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
         document = {
@@ -319,6 +324,7 @@ class MPCPolicy(BasePolicy):
             "solver": self.solver_name,
             "solver_options": self.solver_options,
             "exploration_noise": self.exploration_noise,
+            "seed": self._seed,
             "observation_space": box_to_json(observation_space),
             "action_space": box_to_json(self._action_box),
         }
@@ -343,5 +349,6 @@ class MPCPolicy(BasePolicy):
                 observation_space=box_from_json(document["observation_space"]),
                 action_space=box_from_json(document["action_space"]),
                 exploration_noise=document.get("exploration_noise", 0.1),
+                seed=document.get("seed", 0),
                 **document["solver_options"],
             )

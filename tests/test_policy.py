@@ -481,6 +481,17 @@ def test_a_saved_policy_acts_the_same(tmp_path: Path, pendulum: MPCPolicy) -> No
     np.testing.assert_array_equal(loaded.predict(observations(8))[0], pendulum.predict(observations(8))[0])
 
 
+def test_the_seed_of_the_noise_is_saved(tmp_path: Path) -> None:
+    policy, x = MPCPolicy(lq_plant.make_mpc(), seed=3), np.zeros((4, 2))
+    policy.set_random_seed(9)
+    first = policy.predict(x, deterministic=False)[0]
+    policy.save(tmp_path / "p.zip")
+    loaded = MPCPolicy.load(tmp_path / "p.zip")
+    np.testing.assert_array_equal(loaded.predict(x, deterministic=False)[0], first)
+    with pytest.raises(InvalidArgumentError, match="seed: expected an integer >= 0, got -1"):
+        MPCPolicy(lq_plant.make_mpc(), seed=-1)
+
+
 def test_solver_and_options_are_saved(tmp_path: Path) -> None:
     policy = MPCPolicy(lq_plant.make_mpc(), "ipopt", exploration_noise=0.3, max_iterations=17, tolerance=1e-6)
     policy.save(tmp_path / "p.zip")
