@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import lzma
+import math
 import os
 import struct
 import tokenize
@@ -140,6 +141,19 @@ def file_errors(path: str | PathLike[str]) -> Iterator[None]:
         yield
     except (*_MISFITS, MPCOfflineError) as error:
         raise FileFormatError(str(path), expected="a complete mpcoffline file", actual=f"{error!r}") from error
+
+
+def plain(value: Any) -> Any:
+    """What JSON can say of numbers, arrays, texts, paths, and lists and dictionaries of these; NaN and inf are null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
 def box_to_json(space: spaces.Box) -> dict[str, Any]:

@@ -156,14 +156,15 @@ class Fit:
         kind, config = self._config.terminal, self._config
         if kind == "given":
             return mpc
+        goal = np.zeros(mpc.nx) if mpc.reference is None else mpc.reference
         if kind == "norm":
-            return mpc.replace(terminal_cost=NormCost(_reference(mpc)))
+            return mpc.replace(terminal_cost=NormCost(goal))
         potential = result.potential
         terminal_cost = fit_terminal(
             kind,
             value if potential is None else lambda s: value(s) - potential(s),
             table.observations[_some_rows(len(table), _TERMINAL_ROWS)],
-            x_ref=_reference(mpc),
+            x_ref=goal,
             blend=config.terminal_blend,
             seed=self._seed,
         )
@@ -268,11 +269,3 @@ def _check_device(device: str) -> None:
         raise InvalidArgumentError(
             "device", expected="a torch device of this machine", actual=f"{device!r}: {error}", hint="Use device='cpu'."
         ) from error
-
-
-def _reference(mpc: MPC) -> NDArray[np.float64]:
-    """Where the MPC is to go: the reference of its stage cost or terminal cost, else the origin."""
-    for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
-        if name in mpc.values:
-            return mpc.values[name]
-    return np.zeros(mpc.nx)

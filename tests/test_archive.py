@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lq_plant import make_mpc, random_log
 
-from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.archive import box_from_json, box_to_json, file_errors, plain, read_archive, write_archive
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageError
 from mpcoffline.learner import OfflineMPCLearner
 from mpcoffline.policy import MPCPolicy
@@ -97,6 +97,17 @@ def test_a_write_that_fails_leaves_the_old_file(
         write_archive(path, "thing", {"text": "new"})
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["x.zip"]
+
+
+def test_what_is_plain_is_what_json_can_say() -> None:
+    given = {
+        1: np.array([1.5, np.nan]),
+        "a": (np.int64(2), np.float32(0.5), np.bool_(True)),
+        "p": Path("x"),
+        "n": -np.inf,
+    }
+    assert plain(given) == {"1": [1.5, None], "a": [2, 0.5, True], "p": "x", "n": None}
+    assert json.loads(json.dumps(plain(given), allow_nan=False)) == plain(given)
 
 
 def test_a_folder_that_is_missing_is_named_not_a_temporary_file(tmp_path: Path) -> None:

@@ -254,12 +254,12 @@ def _optimum(recipe: Recipe, scores: Sequence[AgentScore]) -> list[str]:
         return []
     from scipy.linalg import solve_discrete_are
 
-    from .collection import starting_states
+    from .collection import FIRST_START, starting_states
 
     task, root = env.unwrapped, DISCOUNT**0.5
     weights = (np.diag([9.0, 9.0, 1.0, 1.0]), np.diag([0.1, 0.1]))
     P = solve_discrete_are(root * task.A, root * task.B, *weights)
-    s = starting_states(env, "broad", scores[0].episodes)
+    s = starting_states(env, ["broad"] * scores[0].episodes, FIRST_START)
     best = float(np.einsum("bi,ij,bj->b", s, P, s).mean())
     return [
         f"The optimum without input bounds (discounted Riccati equation) is Jd = {best:.2f} on these starts: the agent"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 DISCOUNT = 0.9
 EPISODE_STEPS = 100
+FIRST_START = 10_000
 
 
 def collect(
@@ -139,7 +140,7 @@ class AgentScore:
     success: float
 
 
-def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed: int = 10_000) -> list[AgentScore]:
+def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed: int = FIRST_START) -> list[AgentScore]:
     """Runs a deterministic agent from fresh starts of every kind that the task knows, all episodes at once.
 
     Args:
@@ -154,7 +155,7 @@ def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed:
     task = cast("ControlTask", env.unwrapped)
     scores = []
     for start in task.starts:
-        state = starting_states(env, start, episodes, seed=seed)
+        state = starting_states(env, [start] * episodes, seed)
         costs = np.empty((EPISODE_STEPS, episodes))
         for k in range(EPISODE_STEPS):
             action = np.asarray(agent.predict(task.observe(state), deterministic=True)[0], dtype=np.float64)
@@ -169,10 +170,10 @@ def score_agent(agent: Any, env: gym.Env[Any, Any], *, episodes: int = 20, seed:
     return scores
 
 
-def starting_states(env: gym.Env[Any, Any], start: str, episodes: int, *, seed: int = 10_000) -> NDArray[np.float64]:
-    """Initial states ``(episodes, nx)`` of the kind ``start``, one seed each from ``seed`` on."""
-    resets = (env.reset(seed=seed + i, options={"start": start})[1] for i in range(episodes))
-    return np.stack([info["state"] for info in resets])
+def starting_states(env: gym.Env[Any, Any], starts: Sequence[str], seed: int) -> NDArray[np.float64]:
+    """The states ``(n, ns)`` that ``evaluate`` starts from with these kinds of start, a seed each from ``seed`` on."""
+    resets = (env.reset(seed=seed + i, options={"start": start}) for i, start in enumerate(starts))
+    return np.stack([info["state"] for _, info in resets])
 
 
 class _FixedScale(BaseFeaturesExtractor):

@@ -26,7 +26,6 @@ from .measures import (
     one_step_error,
     outside_support,
     predicted_states,
-    reference_of,
     returns_of,
     value_check,
 )
@@ -98,7 +97,7 @@ def diagnose(
     comparison = Comparison.of(first, second, cost.r2)
     lag = lag_check(identified, clean)
     verdict, reasons = decide(comparison, lag, found.noise, len(table))
-    reference = reference_of(learned)
+    reference = learned.reference
     report = Report(
         verdict=verdict,
         reasons=reasons,

@@ -246,15 +246,6 @@ def goal_share(table: TransitionTable, reference: Array) -> float:
     return float(np.mean((np.abs(table.observations - reference) < _NEAR * scale).all(axis=1)))
 
 
-def reference_of(mpc: MPC) -> Array | None:
-    """The state that the stage cost pulls to, where it has one, ``(nx,)``."""
-    values = mpc.values
-    for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
-        if name in values and values[name].shape == (mpc.nx,):
-            return values[name]
-    return None
-
-
 def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
     """Parameters on a bound that were not on it before; the zeros of a matrix factor's diagonal are no bounds."""
     names = []

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.archive import plain
 from mpcoffline.learning.smoothing import NoiseEstimate
 
 from .measures import LagCheck, RegionError, ValueCheck
@@ -143,7 +142,7 @@ class Report:
         data = {name: value for name, value in asdict(self).items() if name != "traces"}
         data["comparison"] |= {"ratios": list(self.comparison.ratios), "limit": self.comparison.limit}
         data["noise"] |= {"level": self.noise.level}
-        return json.dumps(_plain(data), indent=2, allow_nan=False)
+        return json.dumps(plain(data), indent=2, allow_nan=False)
 
     def figure(self, path: str | PathLike[str]) -> list[Path]:
         """Draws the report.
@@ -162,14 +161,3 @@ class Report:
 
 def _numbers(values: tuple[float, ...]) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
-
-
-def _plain(value: Any) -> Any:
-    """Numbers, texts, lists and dictionaries of what dataclasses hold."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value

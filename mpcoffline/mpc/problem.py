@@ -122,6 +122,15 @@ class MPC:
         """The current parameters by name in their natural shapes, e.g. ``{"model.m": 1.0, "stage_cost.W": ...}``."""
         return {block.name: block.value for block in self.space}
 
+    @property
+    def reference(self) -> Array | None:
+        """The state that the stage cost, else the terminal cost, pulls to, ``(nx,)``; None where neither says."""
+        values = self.values
+        for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
+            if name in values and values[name].shape == (self.nx,):
+                return values[name]
+        return None
+
     def with_theta(self, theta: ArrayLike) -> MPC:
         """The same problem with other parameters, theta ``(space.size,)``.
 

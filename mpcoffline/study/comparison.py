@@ -13,6 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mpcoffline.datasets import load_dataset
+from mpcoffline.datasets.collection import starting_states
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.evaluation import evaluate
@@ -23,7 +24,7 @@ from mpcoffline.mpc import MPC, Model, NormCost, Parameter
 from mpcoffline.policy import MPCPolicy
 from mpcoffline.presets import PRESETS
 
-from .references import best_known_costs, initial_states
+from .references import best_known_costs
 from .setups import Setup, setup_of
 
 Condition = Literal["clean", "noise", "mismatch"]
@@ -117,7 +118,7 @@ class _Arena:
 
     def best_known(self) -> Row:
         """The best costs of whole episodes, from the actions of the controllers that ran here among others."""
-        states = initial_states(self.setup.make_env(), self.starts, FIRST_START)
+        states = starting_states(self.setup.make_env(), self.starts, FIRST_START)
         costs = [best_known_costs(self.group.task, states, self.actions, gamma).mean() for gamma in (1.0, 0.9)]
         return self._row("best known", *costs, None)
 

@@ -124,9 +124,3 @@ def replay(env_id: str, states: Array, actions: Array, discount: float = 1.0) ->
         total += discount**step * info["cost"]
     env.close()
     return Replay(np.stack(along, axis=1), total)
-
-
-def initial_states(env: gym.Env[Any, Any], starts: Sequence[str], seed: int) -> Array:
-    """The states ``(n, ns)`` that ``evaluate`` starts from with these kinds of start and this seed."""
-    resets = (env.reset(seed=seed + i, options={"start": start}) for i, start in enumerate(starts))
-    return np.stack([info["state"] for _, info in resets])

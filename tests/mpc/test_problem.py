@@ -14,6 +14,7 @@ import pytest
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC, Constraint, Model, NormCost, Parameter, Penalty, QuadraticCost, StateBounds
+from mpcoffline.mpc.parameters import ParameterSpace
 from mpcoffline.tasks import nominal_mpc
 
 
@@ -134,6 +135,25 @@ def test_with_theta() -> None:
     for bad in (theta[:-1], np.where(np.arange(len(theta)) == 0, 0.01, theta), theta * np.nan):
         with pytest.raises(InvalidArgumentError, match="theta"):
             mpc.with_theta(bad)
+
+
+def test_the_reference_is_the_stage_costs_else_the_terminal_costs() -> None:
+    class InputCost(QuadraticCost):
+        """u^2, which pulls the state nowhere."""
+
+        def __init__(self) -> None:
+            self.space = ParameterSpace([])
+
+        def expression(self, x: ca.SX, u: ca.SX, p: Any) -> ca.SX:
+            return ca.sumsqr(u)
+
+        def terminal_expression(self, x: ca.SX, p: Any) -> ca.SX:
+            return ca.SX(0)
+
+    there = NormCost([9.0, 8.0])
+    np.testing.assert_array_equal(make_mpc(terminal_cost=there).reference, [0.3, 0.0])
+    np.testing.assert_array_equal(make_mpc(stage_cost=InputCost(), terminal_cost=there).reference, [9.0, 8.0])
+    assert make_mpc(stage_cost=InputCost(), terminal_cost=InputCost()).reference is None
 
 
 def test_stage_and_terminal_functions() -> None:

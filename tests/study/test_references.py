@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from grid_dp import GridOptimum, simulate
 
+from mpcoffline.datasets.collection import starting_states
 from mpcoffline.errors import InvalidArgumentError
-from mpcoffline.study.references import EPISODE, best_known_costs, initial_states, replay
+from mpcoffline.study.references import EPISODE, best_known_costs, replay
 
 PENDULUM, CARTPOLE = "mpcoffline/PendulumSwingUp-v0", "mpcoffline/CartPoleSwingUp-v0"
 
 
 def test_a_replay_is_the_environment() -> None:
     env = gym.make(CARTPOLE)
-    states = initial_states(env, ["broad", "hanging"], seed=3)
+    states = starting_states(env, ["broad", "hanging"], seed=3)
     actions = np.random.default_rng(0).uniform(-2, 2, size=(2, EPISODE, 1))
     found = replay(CARTPOLE, states, actions, discount=0.9)
     for i, start in enumerate(("broad", "hanging")):
@@ -30,7 +31,7 @@ def test_a_replay_is_the_environment() -> None:
 
 
 def test_no_guess_is_cheaper() -> None:
-    states = initial_states(gym.make(CARTPOLE), ["broad"] * 3, seed=0)
+    states = starting_states(gym.make(CARTPOLE), ["broad"] * 3, seed=0)
     guess = np.random.default_rng(1).uniform(-0.5, 0.5, size=(3, EPISODE, 1))
     costs = best_known_costs("cartpole", states, [guess])
     assert (costs <= replay(CARTPOLE, states, guess).cost).all()
@@ -39,7 +40,7 @@ def test_no_guess_is_cheaper() -> None:
 
 @pytest.mark.slow
 def test_it_agrees_with_dynamic_programming() -> None:
-    states = initial_states(gym.make(PENDULUM), ["broad"] * 8 + ["hanging"] * 4, seed=0)
+    states = starting_states(gym.make(PENDULUM), ["broad"] * 8 + ["hanging"] * 4, seed=0)
     loops = simulate(GridOptimum(), states)
     costs = best_known_costs("pendulum", states, discount=0.9)
     # The grid's policy is optimal up to its resolution: it must not be much better, nor much worse.
