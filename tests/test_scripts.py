@@ -39,7 +39,7 @@ def call(checkout: Path, script: str, *arguments: str) -> subprocess.CompletedPr
     )
 
 
-@pytest.mark.parametrize("script", ["quickstart", "test"])
+@pytest.mark.parametrize("script", ["quickstart", "test", "test_oldest", "docs"])
 def test_what_is_missing_is_named_and_nothing_is_made(checkout: Path, script: str) -> None:
     done = call(checkout, script)
     assert (done.returncode, done.stdout) == (2, "")
@@ -55,7 +55,7 @@ def test_what_is_missing_is_named_and_nothing_is_made(checkout: Path, script: st
     assert not (checkout / ".venv").exists()
 
 
-@pytest.mark.parametrize("script", ["quickstart", "test"])
+@pytest.mark.parametrize("script", ["quickstart", "test", "test_oldest", "docs"])
 def test_help_says_what_the_script_does(checkout: Path, script: str) -> None:
     done = call(checkout, script, "--help")
     assert done.returncode == 0

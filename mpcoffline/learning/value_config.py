@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from mpcoffline.checks import check_integers, check_number
@@ -10,7 +11,14 @@ from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
 from .value_methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
 
-VALUE_METHODS = ("residual", "td", "expectile", "iql", "auto")
+# The loss of each name, given the expectile tau.
+_LOSSES: dict[str, Callable[[float], ValueMethod]] = {
+    "residual": lambda tau: Residual(),
+    "td": lambda tau: TemporalDifference(),
+    "expectile": Expectile,
+    "iql": ImplicitQ,
+}
+VALUE_METHODS = (*_LOSSES, "auto")
 
 
 @dataclass(frozen=True)
@@ -62,13 +70,8 @@ class ValueConfig:
         Args:
             noisy: What ``"auto"`` goes by.
         """
-        methods: dict[str, ValueMethod] = {
-            "residual": Residual(),
-            "td": TemporalDifference(),
-            "expectile": Expectile(self.tau),
-            "iql": ImplicitQ(self.tau),
-        }
-        return methods[("iql" if noisy else "expectile") if self.method == "auto" else self.method]
+        name = ("iql" if noisy else "expectile") if self.method == "auto" else self.method
+        return _LOSSES[name](self.tau)
 
 
 def cosine(step: int, n_steps: int) -> float:
