@@ -122,7 +122,7 @@ def diagnose(
             reference,
         ),
     )
-    return report.with_notes(_notes(report))
+    return report.with_notes(_notes(report, smoothed=learner.config.init == "identified"))
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:
@@ -147,16 +147,14 @@ def _theorem(
     )
 
 
-def _notes(report: Report) -> tuple[str, ...]:
-    """What explains the verdict or may spoil the next fit, with what to do."""
+def _notes(report: Report, *, smoothed: bool) -> tuple[str, ...]:
+    """What explains the verdict or may spoil the next fit, with what to do; ``smoothed``: the fit removed noise."""
     notes = []
     if report.goal_share is not None and report.goal_share < _SCARCE_GOAL:
         notes.append("The log never reaches the goal: V is a guess there. Record episodes that end at the reference.")
     if not report.noise.negligible:
-        notes.append(
-            f"Measurement noise of {report.noise.level:.1%}: states were smoothed here. Fit with init='identified',"
-            " which does the same."
-        )
+        advice = "as in the fit" if smoothed else "fit with init='identified', which does the same"
+        notes.append(f"Measurement noise of {report.noise.level:.1%}: states were smoothed here; {advice}.")
     if report.value.n and report.value.correlation < _BLIND_VALUE:
         notes.append("V hardly follows the measured returns: learn it longer, or by another method.")
     if report.prediction.learned > _WORSE_MODEL * report.prediction.identified + 0.01:

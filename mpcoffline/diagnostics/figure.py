@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style, save_figure
+from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from .report import Report
 
@@ -18,15 +18,11 @@ _HEIGHT = 4.6
 _POINTS = 1_500
 
 
-def draw(report: Report, stem: Path) -> list[Path]:
+def draw(report: Report) -> Figure:
     """Draws relative costs on the models, closed loops, V against returns, and the error of (FIT).
 
     Args:
         report: What to draw.
-        stem: Path without suffix.
-
-    Returns:
-        The PDF and the PNG.
     """
     with paper_style():
         figure = new_figure(PAGE_WIDTH, _HEIGHT)
@@ -36,7 +32,7 @@ def draw(report: Report, stem: Path) -> list[Path]:
         _draw_distances(axes[0, 1], report)
         _draw_value(axes[1, 0], report)
         _draw_fit(axes[1, 1], report)
-        return save_figure(figure, stem)
+    return figure
 
 
 def _draw_ratios(axes: Axes, report: Report) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,12 @@ from .measures import LagCheck, RegionError, ValueCheck
 from .stability import TheoremCheck, WeightCheck
 from .verdict import Comparison, Verdict
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Array = NDArray[np.float64]
+
+_WIDTH = 84  # of the text
 
 
 @dataclass(frozen=True)
@@ -101,9 +108,9 @@ class Report:
     def __str__(self) -> str:
         """The report as plain text."""
         c, p, ratios = self.comparison, self.prediction, np.array(self.comparison.ratios)
-        lines = [f"Verdict: {self.verdict}", *(f"  - {reason}" for reason in self.reasons)]
+        lines = [f"Verdict: {self.verdict}", *map(_item, self.reasons)]
         if self.notes:
-            lines += ["Notes", *(f"  - {note}" for note in self.notes)]
+            lines += ["Notes", *map(_item, self.notes)]
         rows = [
             ("data", f"{self.n_rows} rows, {self.n_episodes} episodes"),
             ("models, starts, steps", f"{len(ratios)}, {c.n_starts}, {c.n_steps}"),
@@ -135,7 +142,7 @@ class Report:
         v = self.value
         if not v.n:
             return "no episode is long enough"
-        return f"rank correlation {v.correlation:.2f}, bias {v.bias:+.2f} std, above {v.above:.0%} ({v.n} returns)"
+        return f"correlation {v.correlation:.2f}, bias {v.bias:+.2f} std, above {v.above:.0%} of {v.n}"
 
     def to_json(self) -> str:
         """The report as JSON text; what is not finite becomes null."""
@@ -144,8 +151,18 @@ class Report:
         data["noise"] |= {"level": self.noise.level}
         return json.dumps(plain(data), indent=2, allow_nan=False)
 
+    def plot(self) -> Figure:
+        """Draws the report: relative costs on the models, closed loops, V against returns, and the error of (FIT).
+
+        Returns:
+            The figure; a notebook shows it.
+        """
+        from .figure import draw
+
+        return draw(self)
+
     def figure(self, path: str | PathLike[str]) -> list[Path]:
-        """Draws the report.
+        """Writes :meth:`plot`.
 
         Args:
             path: Where; PDF and PNG are written, whichever of them it names.
@@ -153,10 +170,15 @@ class Report:
         Returns:
             The files.
         """
-        from .figure import draw
+        from mpcoffline.plotting import save_figure
 
         stem = Path(path)
-        return draw(self, stem.with_suffix("") if stem.suffix.lower() in (".pdf", ".png") else stem)
+        return save_figure(self.plot(), stem.with_suffix("") if stem.suffix.lower() in (".pdf", ".png") else stem)
+
+
+def _item(text: str) -> str:
+    """A list item, wrapped."""
+    return textwrap.fill(text, _WIDTH, initial_indent="  - ", subsequent_indent="    ", break_on_hyphens=False)
 
 
 def _numbers(values: tuple[float, ...]) -> str:

@@ -209,7 +209,7 @@ def _tell(method: ValueMethod, found: Stochasticity | None, config: ValueConfig,
             100.0 * found.cost,
         )
     sweeps = config.polyak * config.n_steps * (1.0 - discount)
-    if sweeps < _SWEEPS and discount < 1.0 and not isinstance(method, Residual):
+    if sweeps < _SWEEPS * (1.0 - 1e-9) and discount < 1.0 and not isinstance(method, Residual):
         _log.warning(
             "(VALUE) may end before V has settled: polyak * n_steps * (1 - discount) is %.2g, below %g; raise n_steps "
             "(%d) or polyak (%g)",

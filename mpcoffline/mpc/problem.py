@@ -143,6 +143,15 @@ class MPC:
         }
         return replace(self, **parts)
 
+    def with_values(self, values: Mapping[str, ArrayLike]) -> MPC:
+        """The same problem with some parameters replaced by name, e.g. ``{"model.m": 1.2}``; see :attr:`values`.
+
+        Raises:
+            UnknownIdError: For a name that no parameter has.
+            InvalidArgumentError: For a wrong shape, a matrix that is not PSD, or a value out of bounds.
+        """
+        return self.with_theta(self.space.pack(values))
+
     def theta_along(self, values: Mapping[str, ArrayLike]) -> Array:
         """One theta a stage, for time-varying references, prices, weights or models.
 

@@ -7,7 +7,7 @@ A learner's: :func:`training_figure`, :func:`cost_figure`, :func:`loop_figure`, 
 from __future__ import annotations
 
 from .animation import animate, check_film
-from .costs import cost_figure
+from .costs import cost_figure, draw_weights, stage_weights
 from .loops import loop_figure
 from .portrait import phase_portrait
 from .signals import Signal, draw_bars, draw_signal
@@ -20,6 +20,7 @@ from .style import (
     LineStyle,
     controller_label,
     legend_handles,
+    line_of,
     new_figure,
     paper_style,
     save_figure,
@@ -40,11 +41,14 @@ __all__ = [
     "cost_figure",
     "draw_bars",
     "draw_signal",
+    "draw_weights",
     "legend_handles",
+    "line_of",
     "loop_figure",
     "new_figure",
     "paper_style",
     "phase_portrait",
     "save_figure",
+    "stage_weights",
     "training_figure",
 ]

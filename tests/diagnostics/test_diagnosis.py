@@ -58,7 +58,7 @@ def test_text_and_json_say_the_same(good: Report) -> None:
     assert data["theorem"]["eigenvalues"] == pytest.approx(good.theorem.eigenvalues)
     assert "traces" not in data
     assert f"{good.comparison.ratios[0]:.3f} identified" in text
-    assert all(len(line) < 200 for line in text.splitlines())
+    assert all(len(line) < 100 for line in text.splitlines())
 
 
 def test_the_figure_is_drawn(good: Report, tmp_path: Path) -> None:

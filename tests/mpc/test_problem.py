@@ -137,6 +137,17 @@ def test_with_theta() -> None:
             mpc.with_theta(bad)
 
 
+def test_with_values_replaces_by_name_and_keeps_the_rest() -> None:
+    mpc = make_mpc().with_values({"model.m": 3.0})
+    again = mpc.with_values({"stage_cost.R": [[4.0]]})
+    assert (again.values["model.m"], again.values["stage_cost.R"]) == (3.0, 4.0)
+    assert mpc.values["stage_cost.R"] == 0.2
+    with pytest.raises(UnknownIdError, match=r"model\.mass"):
+        mpc.with_values({"model.mass": 1.0})
+    with pytest.raises(InvalidArgumentError):
+        mpc.with_values({"model.m": 0.01})
+
+
 def test_the_reference_is_the_stage_costs_else_the_terminal_costs() -> None:
     class InputCost(QuadraticCost):
         """u^2, which pulls the state nowhere."""
@@ -170,7 +181,7 @@ def test_constraints_see_the_model_parameters() -> None:
     h = mpc.constraint_function
     assert h is not None
     np.testing.assert_allclose(h([0, 3], [0], mpc.theta).full().ravel(), [2.0, -4.0])
-    heavier = mpc.with_theta(mpc.space.pack({"model.m": 2.0}))
+    heavier = mpc.with_values({"model.m": 2.0})
     np.testing.assert_allclose(h([0, 3], [0], heavier.theta).full().ravel(), [1.0, -4.0])
     assert make_mpc().constraint_function is None
 
