@@ -146,17 +146,10 @@ class TransitionTable:
                 or terminations that are not boolean.
         """
         s, a = floats(name, "observations", observations, 2), floats(name, "actions", actions, 2)
-        cost, s_next = (
-            floats(name, "costs", costs, 1),
-            floats(name, "next_observations", next_observations, 2),
-        )
+        cost, s_next = floats(name, "costs", costs, 1), floats(name, "next_observations", next_observations, 2)
         terminated = floats(name, "terminations", terminations, 1)
-        for column, array in (
-            ("actions", a),
-            ("costs", cost),
-            ("next_observations", s_next),
-            ("terminations", terminated),
-        ):
+        others = {"actions": a, "costs": cost, "next_observations": s_next, "terminations": terminated}
+        for column, array in others.items():
             if len(array) != len(s):
                 raise InvalidDataError(
                     f"{name}: {column}", expected=f"{len(s)} rows, as in observations", actual=str(len(array))
@@ -254,11 +247,25 @@ class TransitionTable:
             ]
             offset += len(episodes)
         label = name or " + ".join(table.name for table in tables)
-        for table in tables:
-            if table.is_mapped:
-                return table._like(blocks, label)
-        rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        return cls(rows, first.ny, first.nu, ids, label)
+        return next((table for table in tables if table.is_mapped), first).rewritten(blocks, label)
+
+    def rewritten(
+        self, blocks: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]], name: str | None = None
+    ) -> TransitionTable:
+        """A table of other rows, and of their size: a mapped one gives a mapped one, in a file that vanishes with it.
+
+        Args:
+            blocks: Packed rows ``(B, 2 ny + nu + 2)`` and their episodes ``(B,)``, one block after another.
+            name: What error messages call it; the name of this one by default.
+
+        Raises:
+            StorageError: Where a mapped table cannot be written.
+        """
+        if self._file is None:
+            rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+            return TransitionTable(rows, self.ny, self.nu, ids, name or self.name)
+        file = scratch_table(self.ny, self.nu, blocks, self._file.folder.parent)
+        return self._of_file(file, name or self.name, self._memory)
 
     def check_fits(
         self,
@@ -375,12 +382,7 @@ class TransitionTable:
         if self._file is None:
             return TransitionTable(self.rows[index], self.ny, self.nu, self.episode_ids[index], self.name)
         parts = (index[i : i + CHUNK] for i in range(0, len(index), CHUNK))
-        return self._like(((self.rows[part], self.episode_ids[part]) for part in parts), self.name)
-
-    def _like(self, blocks: Iterable[Any], name: str) -> TransitionTable:
-        """A mapped table of these rows and episode ids, in a file that vanishes with it."""
-        cache = default_cache() if self._file is None else self._file.folder.parent
-        return self._of_file(scratch_table(self.ny, self.nu, blocks, cache), name, self._memory)
+        return self.rewritten((self.rows[part], self.episode_ids[part]) for part in parts)
 
     @classmethod
     def _of_file(cls, file: TableFile, name: str, memory: int | None) -> TransitionTable:

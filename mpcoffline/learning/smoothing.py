@@ -152,18 +152,20 @@ def smooth(
         unwrapped: Coordinates that are wrapped angles.
 
     Returns:
-        A new table of the same rows, in memory; actions, costs and terminations as they were.
+        A new table of the same rows; actions, costs and terminations as they were. It is smoothed in chunks, so that
+        a table larger than memory, which is a memory map, gives another one.
 
     Raises:
         InvalidArgumentError: For a noise estimate of another size.
+        StorageError: Where a memory map cannot be written.
     """
     if noise.measurement.shape != (mpc.nx,):
         raise InvalidArgumentError("noise", expected=f"{mpc.nx} coordinates", actual=str(noise.measurement.shape))
-    states = np.empty((2, len(table), mpc.nx), dtype=np.float32)
-    for start in range(0, len(table), _CHUNK):
-        part = _rows_of(table, slice(start, start + _CHUNK))
-        states[:, start : start + _CHUNK] = _smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)
-    return _with_states(table, *states)
+    parts = (_rows_of(table, slice(start, start + _CHUNK)) for start in range(0, len(table), _CHUNK))
+    smooth_parts = (
+        _with_states(part, *_smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)) for part in parts
+    )
+    return table.rewritten((part.rows, part.episode_ids) for part in smooth_parts)
 
 
 def identify_smoothed(

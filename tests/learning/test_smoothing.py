@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from mpcoffline.datasets import TransitionTable
+from mpcoffline.datasets.table_cache import scratch_table
 from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.learning import smoothing
 from mpcoffline.learning.identification import identify
 from mpcoffline.learning.smoothing import (
     NoiseEstimate,
@@ -214,6 +218,20 @@ def test_smoothing_with_known_model_and_noise() -> None:
     assert distance(result, CLEAN) < 0.01
     with pytest.raises(InvalidArgumentError, match="noise"):
         smooth(PENDULUM, CLEAN, PENDULUM.theta, NoiseEstimate(np.zeros(2), np.zeros(2), np.ones(2), "repeated"))
+
+
+def test_a_table_larger_than_memory_gives_one_that_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(smoothing, "_CHUNK", 500)
+    noisy, noise = NOISY["repeated"], NoiseEstimate(np.full(3, 0.05), np.full(3, 1e-3), np.ones(3), "repeated")
+    blocks = [(noisy.rows[i : i + 700], noisy.episode_ids[i : i + 700]) for i in range(0, len(noisy), 700)]
+    file = scratch_table(3, 1, blocks, tmp_path)
+    mapped = TransitionTable(file.rows, 3, 1, file.episode_ids, noisy.name, file=file)
+    found, expected = (smooth(PENDULUM, table, PENDULUM.theta, noise) for table in (mapped, noisy))
+    assert (found.is_mapped, expected.is_mapped, len(noisy) > 500) == (True, False, True)
+    np.testing.assert_array_equal(found.rows, expected.rows)
+    np.testing.assert_array_equal(found.episode_ids, noisy.episode_ids)
+    assert distance(expected, CLEAN) < distance(noisy, CLEAN)
+    np.testing.assert_array_equal(mapped.rows, noisy.rows)
 
 
 def test_a_long_trajectory_is_smoothed_in_pieces() -> None:
