@@ -62,7 +62,7 @@ class OfflineMPCLearner:
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"`` or ``"auto"``; overrides the
             preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
-        device: Torch device for (VALUE).
+        device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
         **overrides: Any field of :class:`~mpcoffline.presets.LearnerConfig`, ``ValueConfig`` or ``FitConfig``, e.g.
             ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; names that two have take a prefix (``value_n_steps``,
             ``fit_n_steps``).
