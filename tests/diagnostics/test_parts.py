@@ -21,7 +21,6 @@ from mpcoffline.diagnostics.measures import (
     lag_check,
     one_step_error,
     outside_support,
-    reference_of,
     returns_of,
     value_check,
 )
@@ -206,7 +205,7 @@ def test_a_late_input_is_found_and_a_wrong_structure_is_not_taken_for_one() -> N
 def test_whether_the_log_reaches_the_goal() -> None:
     assert goal_share(LOG, np.zeros(2)) > 0.01
     assert goal_share(LOG, np.array([30.0, 0.0])) == 0.0
-    assert reference_of(lq_plant.make_mpc()).tolist() == [0.0, 0.0]
+    np.testing.assert_array_equal(lq_plant.make_mpc().reference, [0.0, 0.0])
 
 
 def test_parameters_on_a_bound_are_named() -> None:
