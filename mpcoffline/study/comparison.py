@@ -168,17 +168,24 @@ def _swing_up_rows(arena: _Arena, table: TransitionTable, values: dict[str, Valu
     for name, learn in (("MPC_2 (paper)", "cost"), ("MPC_3 (paper)", "cost+model")):
         learner, seconds = _learned(nominal, table, values, "paper", cast("Learn", learn), preset="paper")
         yield arena.row(name, learner.mpc, seconds)
+    yield from _identified_rows(arena, nominal, table, values)
     learner, seconds = _learned(nominal, table, values, "default", "cost+model", preset="default")
-    learned = learner.mpc
-    nominal_cost = learned.replace(stage_cost=nominal.stage_cost)
-    reference = nominal.values["stage_cost.x_ref"]
-    yield arena.row("identified", nominal_cost.replace(terminal_cost=NormCost(reference), horizon=nominal.horizon))
-    yield arena.row("identified, T from V", nominal_cost)
-    yield arena.row("default", learned, seconds)
+    yield arena.row("default", learner.mpc, seconds)
     fast, fast_seconds = _learned(nominal, table, values, "default", "cost+model", preset="fast")
     yield arena.row("fast", fast.mpc, fast_seconds)
     # "best" is the default fit at a longer horizon.
-    yield arena.row("best", learned.replace(horizon=PRESETS["best"].horizon), seconds)
+    yield arena.row("best", learner.mpc.replace(horizon=PRESETS["best"].horizon), seconds)
+
+
+def _identified_rows(
+    arena: _Arena, nominal: MPC, table: TransitionTable, values: dict[str, ValueFunction]
+) -> Iterator[Row]:
+    """The model identified, the stage cost nominal; with the nominal terminal cost and horizon, and with default's."""
+    learner, _ = _learned(nominal, table, values, "default", "cost+model", preset="default", fit_n_steps=0)
+    identified = learner.mpc.replace(stage_cost=nominal.stage_cost)
+    terminal_cost = NormCost(nominal.values["stage_cost.x_ref"])
+    yield arena.row("identified", identified.replace(terminal_cost=terminal_cost, horizon=nominal.horizon))
+    yield arena.row("identified, T from V", identified)
 
 
 def _linear_rows(arena: _Arena, table: TransitionTable, values: dict[str, ValueFunction]) -> Iterator[Row]:
