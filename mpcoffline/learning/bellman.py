@@ -9,6 +9,7 @@ from mpcoffline.datasets.transitions import Columns
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
+from .identification import FULL_TURN, Rows, without_jumps
 from .value import ValueFunction
 
 
@@ -74,20 +75,31 @@ class PredictionError:
 
         E_D[ mean_i ((s+_i - f_th(s,a)_i) / std_D[s+_i - s_i])^2 ]
 
-    Zero for the true model of a deterministic plant, about one for a model that predicts no motion.
+    Zero for the true model of a deterministic plant, about one for a model that predicts no motion. Full turns of
+    angles that are confined to one turn do not count.
 
     Args:
         problem: Has the model.
-        sample: Transitions that decide the spread.
+        sample: Transitions that decide the spread, and which coordinates are such angles.
+        theta: Parameters with which the model predicts well enough to see jumps of a full turn.
     """
 
-    def __init__(self, problem: BellmanFit, sample: Columns) -> None:
+    def __init__(self, problem: BellmanFit, sample: Columns, theta: Tensor) -> None:
         self._problem = problem
-        spread = (sample.next_observations - sample.observations).double().std(dim=0, correction=0)
+        s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
+        with torch.no_grad():
+            missed = reached - problem.predicted(sample, theta)
+        rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
+        spread = (torch.from_numpy(rows.reached) - s).std(dim=0, correction=0)
         self._scale = torch.where(spread > 0.0, spread, 1.0)
 
     def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean error over a minibatch, a scalar."""
         missed = batch.next_observations.double() - self._problem.predicted(batch, theta)
+        if self._angles:
+            turns = torch.zeros_like(missed)
+            angles = list(self._angles)
+            turns[:, angles] = FULL_TURN * torch.round(missed.detach()[:, angles] / FULL_TURN)
+            missed = missed - turns
         error: Tensor = (missed / self._scale).square().mean()
         return error

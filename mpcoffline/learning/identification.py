@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-_FULL_TURN = 2.0 * np.pi
+FULL_TURN = 2.0 * np.pi
 _NEAR_TURN = 0.5  # rad
 _AT_BOUND = 1e-4  # in scaled coordinates
 _WEAKEST_PRIOR = 1e-10
@@ -289,13 +289,13 @@ def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
 
     These are confined to one turn, and their prediction errors are either small or near a full turn.
     """
-    turns = np.round(np.nan_to_num(errors) / _FULL_TURN)
+    turns = np.round(np.nan_to_num(errors) / FULL_TURN)
     jumps = turns != 0.0
-    near = np.abs(errors - _FULL_TURN * turns) < _NEAR_TURN
-    confined = np.ptp(np.concatenate([rows.x, rows.reached]), axis=0) <= 1.05 * _FULL_TURN
+    near = np.abs(errors - FULL_TURN * turns) < _NEAR_TURN
+    confined = np.ptp(np.concatenate([rows.x, rows.reached]), axis=0) <= 1.05 * FULL_TURN
     count = jumps.sum(axis=0)
     wrapped = confined & (count > 0) & ((jumps & near).sum(axis=0) >= 0.9 * count)
-    reached = rows.reached + np.where(wrapped & jumps, _FULL_TURN * turns, 0.0)
+    reached = rows.reached + np.where(wrapped & jumps, FULL_TURN * turns, 0.0)
     return rows._replace(reached=reached), tuple(int(i) for i in np.flatnonzero(wrapped))
 
 

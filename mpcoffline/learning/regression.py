@@ -140,7 +140,7 @@ class ParameterTraining:
         self._problem = BellmanFit(mpc, value, float(table.costs.var(dtype=np.float64)) or 1.0)
         rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
         self._sample = table.columns(torch.from_numpy(table.rows[rows]))
-        self._prediction_error = PredictionError(self._problem, self._sample)
+        self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))
         self._coordinates = Coordinates(mpc, groups)
         with torch.no_grad():
             self._loss_before = float(self._problem.error(self._sample, torch.from_numpy(mpc.theta)))

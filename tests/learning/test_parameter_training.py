@@ -12,6 +12,7 @@ import pytest
 import torch
 from lq_plant import BEST, QuadraticValue
 
+from mpcoffline.datasets import TransitionTable
 from mpcoffline.learning import FitConfig, ParameterTraining
 from mpcoffline.learning.bellman import BellmanFit, PredictionError
 from mpcoffline.mpc import MPC, Model, Parameter
@@ -79,8 +80,33 @@ def test_the_prediction_error_is_its_formula() -> None:
     )
     missed = reached - (s @ lq_plant.MODEL_A.T + a @ lq_plant.MODEL_B.T)
     expected = np.mean((missed / (reached - s).std(axis=0)) ** 2)
-    found = PredictionError(problem, sample)(sample, torch.from_numpy(mpc.theta))
+    theta = torch.from_numpy(mpc.theta)
+    found = PredictionError(problem, sample, theta)(sample, theta)
     assert float(found) == pytest.approx(expected, rel=1e-6)
+
+
+def test_full_turns_of_a_wrapped_angle_are_no_prediction_error() -> None:
+    """The same motion, once with the angle as it is and once confined to [-pi, pi)."""
+
+    def step(x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        return ca.vertcat(x[0] + 0.1 * x[1], x[1] + p["b"] * u[0])
+
+    mpc = lq_plant.make_mpc().replace(model=Model(step, 2, 1, 0.1, {"b": 0.2}, discrete=True))
+    rng = np.random.default_rng(0)
+    s = np.c_[rng.uniform(-np.pi, np.pi, 400), rng.uniform(-3.0, 3.0, 400)]
+    a = rng.uniform(-2.0, 2.0, (400, 1))
+    reached = np.c_[s[:, 0] + 0.1 * s[:, 1], s[:, 1] + 0.1 * a[:, 0]]
+    wrapped = np.c_[(reached[:, 0] + np.pi) % (2.0 * np.pi) - np.pi, reached[:, 1]]
+    assert (np.abs(wrapped - reached) > 1.0).sum() > 10
+    errors = []
+    for following in (reached, wrapped):
+        table = TransitionTable.from_arrays(s, a, a[:, 0] ** 2, following, np.zeros(400))
+        sample = table.columns(torch.from_numpy(table.rows))
+        theta = torch.from_numpy(mpc.theta)
+        errors.append(
+            float(PredictionError(BellmanFit(mpc, QuadraticValue(BEST.P), 1.0), sample, theta)(sample, theta))
+        )
+    assert errors[1] == pytest.approx(errors[0], rel=1e-4)
 
 
 def test_with_a_large_weight_the_model_is_identified() -> None:
