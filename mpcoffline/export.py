@@ -181,8 +181,6 @@ typedef struct {
     int has_plan;
     double x[(MPC_HORIZON + 1) * MPC_NX], u[MPC_HORIZON * MPC_NU];
     double old_x[(MPC_HORIZON + 1) * MPC_NX], old_u[MPC_HORIZON * MPC_NU];
-    double start_x[(MPC_STARTS + 3) / 4][(MPC_HORIZON + 1) * MPC_NX];
-    double start_u[(MPC_STARTS + 3) / 4][MPC_HORIZON * MPC_NU];
     double work_x[(MPC_HORIZON + 1) * MPC_NX], work_u[MPC_HORIZON * MPC_NU];
     double work_x_new[(MPC_HORIZON + 1) * MPC_NX], work_u_new[MPC_HORIZON * MPC_NU];
     double work_k[MPC_HORIZON * MPC_NU], work_K[MPC_HORIZON * MPC_NU * MPC_NX];
