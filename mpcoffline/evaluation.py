@@ -93,6 +93,13 @@ def evaluate(
     check_integers(1, n_episodes=n_episodes)
     if not 0.0 < discount <= 1.0:
         raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=str(discount))
+    if not isinstance(env, str | gym.Env):
+        raise InvalidArgumentError(
+            "env",
+            expected="a Gymnasium environment or the id of one",
+            actual=type(env).__name__,
+            hint="Vector environments go to stable_baselines3's evaluate_policy; here copies step together anyway.",
+        )
     spec = _registered(env) if isinstance(env, str) else env.spec
     if spec is None:
         raise InvalidArgumentError("env", expected="an environment made by gym.make", actual=f"{env} without a spec")

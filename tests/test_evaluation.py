@@ -257,3 +257,11 @@ def test_the_text_names_the_figures() -> None:
     result = evaluate(policy_for(gym.make(PENDULUM)), PENDULUM, 2)
     assert str(result).startswith(f"2 episodes: cost {result.cost.mean():.1f} +- ")
     assert f"discounted {result.discounted_cost.mean():.2f}, success 0%" in str(result)
+
+
+def test_a_vector_environment_is_refused_by_name() -> None:
+    from stable_baselines3.common.env_util import make_vec_env
+
+    env = make_vec_env("mpcoffline/PendulumSwingUp-v0", 1)
+    with pytest.raises(InvalidArgumentError, match=r"DummyVecEnv.*evaluate_policy"):
+        evaluate(MPCPolicy(nominal_mpc("mpcoffline/PendulumSwingUp-v0")), env, 2)  # type: ignore[arg-type]

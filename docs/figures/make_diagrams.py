@@ -180,7 +180,7 @@ def data_flow(theme: Theme) -> str:
 
 #: The modules of each box; every module of the package is in one.
 MODULES = {
-    "cli": ("cli", "cli_common", "cli_datasets", "cli_figures", "cli_learn", "cli_run", "cli_tools"),
+    "cli": ("__main__", "cli", "cli_common", "cli_datasets", "cli_figures", "cli_learn", "cli_run", "cli_tools"),
     "doctor": ("doctor",),
     "export": ("export",),
     "sb3": ("sb3",),

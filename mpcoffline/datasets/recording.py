@@ -66,7 +66,8 @@ class RecordingLock:
                     f"data set {dataset_id!r}",
                     expected="one recorder at a time",
                     actual=f"another one at work ({holder})",
-                    hint="Wait for it, or record under another id; a recorder of this process: `recorder.close()`.",
+                    hint="Wait for it, or record under another id; an interrupted recorder of this process is freed by"
+                    " `recorder.close()`.",
                 ) from error
             # Who held it may have removed the file in the meantime: then it is not the lock any more.
             if self._path.exists() and self._path.stat().st_ino == os.fstat(descriptor).st_ino:
@@ -118,7 +119,7 @@ class Recording:
 
     Raises:
         InvalidArgumentError: For an id that exists (mode ``"new"``), another recorder at work on it, or
-            logs with other spaces.
+            logs with other spaces or of another environment.
         FileFormatError: For logs that are damaged.
         StorageError: Where the disk refuses.
     """
@@ -290,6 +291,13 @@ def _continued(indices: list[LogIndex], header: LogHeader) -> LogHeader:
                 actual=getattr(header, kind),
                 hint=f"Seal it first (`mpcoffline datasets repair {header.dataset_id}`), or pass resume=False.",
             )
+    if None not in (first.env_spec, header.env_spec) and first.env_spec != header.env_spec:
+        raise InvalidArgumentError(
+            "environment",
+            expected=f"that of the interrupted recording of {header.dataset_id!r}: {first.env_spec}",
+            actual=str(header.env_spec),
+            hint=f"Seal it first (`mpcoffline datasets repair {header.dataset_id}`), or pass resume=False.",
+        )
     return first
 
 

@@ -250,6 +250,23 @@ class StopAfter(BaseCallback):
         return True
 
 
+def test_a_recording_is_not_continued_with_another_plant() -> None:
+    def interrupted(mass: float) -> None:
+        recorder = MinariRecorder("mpcoffline/test/plants-v0")
+        try:
+            agent = agent_on(make_vec_env(lambda: gym.make(PENDULUM, m=mass), 1))
+            agent.learn(250, callback=[recorder, StopAfter()])
+        finally:
+            recorder.close()
+
+    with pytest.raises(BrokenOffError):
+        interrupted(1.3)
+    with pytest.raises(InvalidArgumentError, match=r"environment: .*repair"):
+        interrupted(1.5)
+    with pytest.raises(BrokenOffError):
+        interrupted(1.3)
+
+
 def test_a_training_that_fails_is_continued_by_the_next() -> None:
     agent = agent_on(make_vec_env(PENDULUM, 1, seed=0))
     first = MinariRecorder("mpcoffline/test/again-v0")

@@ -1,0 +1,8 @@
+"""``python -m mpcoffline``: the command line."""
+
+from __future__ import annotations
+
+from mpcoffline.cli import app
+
+if __name__ == "__main__":
+    app()
