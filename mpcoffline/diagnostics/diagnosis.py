@@ -148,7 +148,7 @@ def _theorem(
 
 
 def _notes(report: Report, *, smoothed: bool) -> tuple[str, ...]:
-    """What explains the verdict or may spoil the next fit, with what to do; ``smoothed``: the fit removed noise."""
+    """What explains the verdict or may spoil the next fit, with what to do; ``smoothed``: it began by identification."""
     notes = []
     if report.goal_share is not None and report.goal_share < _SCARCE_GOAL:
         notes.append("The log never reaches the goal: V is a guess there. Record episodes that end at the reference.")
@@ -158,13 +158,15 @@ def _notes(report: Report, *, smoothed: bool) -> tuple[str, ...]:
     if report.value.n and report.value.correlation < _BLIND_VALUE:
         notes.append("V hardly follows the measured returns: learn it longer, or by another method.")
     if report.prediction.learned > _WORSE_MODEL * report.prediction.identified + 0.01:
+        advice = "a larger prediction_weight keeps it closer" if smoothed else "init='identified' is the safer start"
         notes.append(
             f"The learned model misses {report.prediction.learned:.1%} of an increment, the identified one"
-            f" {report.prediction.identified:.1%}: Theorem 1 allows that, but init='identified' is the safer start."
+            f" {report.prediction.identified:.1%}: Theorem 1 allows that, but {advice}."
         )
     if report.prediction.undetermined:
         notes.append(
-            f"The data do not determine {', nor '.join(report.prediction.undetermined)}: vary the inputs more."
+            f"The data do not determine {', nor '.join(report.prediction.undetermined)}: vary the"
+            " inputs more; or, if they enter the model as ratios alone, fix one of them as a plain number."
         )
     if report.at_bounds:
         notes.append(f"On a bound: {', '.join(report.at_bounds)}. Widen it if the physics allow, or raise the prior.")
