@@ -257,7 +257,7 @@ def test_reports_come_once_an_epoch_and_at_the_end() -> None:
         ({"tau": 0.0}, "tau"),
         ({"tau": 1.0}, "tau"),
         ({"tau": np.nan}, "tau"),
-        ({"n_steps": 0}, "n_steps: expected an integer >= 1, got 0"),
+        ({"n_steps": 0}, "n_steps: expected a positive integer, got 0"),
         ({"n_steps": 10.5}, "n_steps"),
         ({"n_steps": True}, "n_steps"),
         ({"batch_size": -1}, "batch_size"),

@@ -140,8 +140,8 @@ def test_with_theta() -> None:
 def test_with_values_replaces_by_name_and_keeps_the_rest() -> None:
     mpc = make_mpc().with_values({"model.m": 3.0})
     again = mpc.with_values({"stage_cost.R": [[4.0]]})
-    assert (again.values["model.m"], again.values["stage_cost.R"]) == (3.0, 4.0)
-    assert mpc.values["stage_cost.R"] == 0.2
+    assert (again.values["model.m"], again.values["stage_cost.R"].item()) == (3.0, 4.0)
+    assert mpc.values["stage_cost.R"].item() == pytest.approx(0.2)
     with pytest.raises(UnknownIdError, match=r"model\.mass"):
         mpc.with_values({"model.mass": 1.0})
     with pytest.raises(InvalidArgumentError):
