@@ -90,6 +90,7 @@ class Fit:
         table.check_fits(nominal.nx, nominal.nu, np.asarray(nominal.action_low), np.asarray(nominal.action_high))
         self._groups, self._config, self._table = groups, config, table
         self._seed, self._device = seed, device
+        self._fit_config = config.fit
         _check_device(device)
         self._nominal, self._mpc = nominal, restructured(nominal, config)
         _check_discount(value_function, self._mpc.discount)
@@ -124,6 +125,8 @@ class Fit:
         found = identify_smoothed(self._mpc, table, seed=self._seed)
         if "model" in self._groups:
             self._mpc = self._mpc.with_theta(found.identification.theta)
+            if found.identification.error_after <= self._config.adapt_above:
+                self._fit_config = replace(self._config.fit, n_steps=0)
         return found.table
 
     def _learn_value(self, table: TransitionTable, epoch: int) -> Iterator[Epoch]:
@@ -139,7 +142,7 @@ class Fit:
         if self.value_function is None:  # (VALUE) has ended, or V was given
             return
         value = copy.deepcopy(self.value_function).cpu().eval().requires_grad_(False)
-        training = ParameterTraining(self._mpc, value, table, self._groups, self._config.fit, seed=self._seed)
+        training = ParameterTraining(self._mpc, value, table, self._groups, self._fit_config, seed=self._seed)
         self._begin("fit", training)
         phase, n_steps = f"(FIT) learning {'+'.join(self._groups)}", training.n_steps + 1
         while not training.done:

@@ -31,6 +31,9 @@ class LearnerConfig:
         cross_term: Whether the quadratic stage cost gets a cross term S.
         init: Where the model starts: ``"nominal"`` at theta_0, ``"identified"`` at the smallest one-step prediction
             error, which also removes measurement noise from the data where there is any.
+        adapt_above: With ``init="identified"``, steps on cost and model together (``fit.n_steps``) are made only where
+            the identified model misses more than this share of an increment (root mean square of the one-step
+            errors): where its structure is not the plant's. Else the model stays and the cost alone is fitted.
         value: How V_phi is learned.
         fit: How theta is learned.
     """
@@ -43,6 +46,7 @@ class LearnerConfig:
     terminal_blend: float = 0.0
     cross_term: bool = False
     init: Init = "nominal"
+    adapt_above: float = 0.0
     value: ValueConfig = field(default_factory=ValueConfig)
     fit: FitConfig = field(default_factory=FitConfig)
 
@@ -54,6 +58,7 @@ class LearnerConfig:
         if self.horizon is not None:
             check_integers(1, horizon=self.horizon)
         check_number("terminal_blend", self.terminal_blend, 0.0, 1.0, open_low=False)
+        check_number("adapt_above", self.adapt_above, 0.0, open_low=False)
         if self.fit.potential and self.terminal in ("given", "norm"):
             raise InvalidArgumentError(
                 "potential",
@@ -108,15 +113,16 @@ _DEFAULT = LearnerConfig(
     terminal_blend=0.5,
     init="identified",
     value=ValueConfig(method="auto", tau=0.1, n_steps=3_000, learning_rate=2e-3, polyak=0.02),
-    # Few steps: they adapt a model that cannot become the plant to what (FIT) needs of it, and hardly move a right one.
+    # A model that cannot become the plant is adapted to what (FIT) needs of it; one that predicts well is left alone:
+    # models of the wrong structure missed 13 % of an increment in the study, right ones less than 1 %, noise or not.
+    adapt_above=0.03,
     fit=FitConfig(n_steps=200, prediction_weight=0.1),
 )
 
 PRESETS: dict[str, LearnerConfig] = {
     # The published recipe: (VALUE) by Bellman residual, then (FIT); discount, horizon and terminal cost are the MPC's.
     "paper": LearnerConfig(),
-    # What most users should get: the model by identification, then model and stage cost by (FIT) with the prediction
-    # error beside, the terminal cost from V.
+    # What most users should get: the model by identification, the stage cost by (FIT), the terminal cost from V.
     "default": _DEFAULT,
     # The same at a third of the horizon, which leaves more to the terminal cost: it has to be closer to V.
     "fast": replace(_DEFAULT, horizon=10, terminal_blend=0.25),
