@@ -77,7 +77,7 @@ def _package_fingerprint() -> str:
 
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "build" / "notebooks" / _package_fingerprint())
-nb_execution_timeout = 120
+nb_execution_timeout = 300  # of a cell; a shared machine may take ten times its usual seconds
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_execution_show_tb = True
