@@ -116,7 +116,7 @@ def _say_times(app: Sphinx, exception: Exception | None) -> None:
     data = {page: found["exec_data"] for page, found in app.env.nb_metadata.items() if found.get("exec_data")}
     times = {page: found["runtime"] for page, found in data.items() if found["runtime"] is not None}
     lines = [f"{seconds:6.1f} s  {page}" for page, seconds in sorted(times.items())]
-    print(*lines, f"{sum(times.values()):6.1f} s  all {len(times)} notebooks", sep="\n")  # noqa: T201
+    print(*lines, f"{sum(times.values()):6.1f} s  all {len(times)} notebooks", sep="\n")
 
 
 def setup(app: Sphinx) -> None:

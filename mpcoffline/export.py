@@ -17,10 +17,11 @@ from mpcoffline.solvers import DDPSolver, starts
 from mpcoffline.solvers.ddp.codegen import generated, text
 
 _EPISODES, _STEPS = 4, 20
+# How a start of the test vectors is chosen, see _unambiguous_starts.
 _DRAWS = 40
-_NEARBY, _NEIGHBOURS = 0.05, 32
-_ALIKE = 1e-3  # relative difference of costs
-_SAME_PLAN = 1e-3  # of inputs: a minimum can be flat
+_NEARBY, _NEIGHBOURS = 0.05, 32  # how far from a start its neighbours are, and how many
+_ALIKE = 1e-3  # costs that differ by less, relative to 1 + |J|, are almost as good
+_SAME_PLAN = 1e-3  # inputs that differ by less, relative to 1 + |u|, are one plan: a minimum can be flat
 
 
 def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str]) -> list[Path]:

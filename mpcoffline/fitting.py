@@ -125,8 +125,10 @@ class Fit:
         found = identify_smoothed(self._mpc, table, seed=self._seed)
         if "model" in self._groups:
             self._mpc = self._mpc.with_theta(found.identification.theta)
-            if found.identification.error_after <= self._config.adapt_above:
+            missed = found.identification.error_after
+            if self._config.fit.n_steps and missed <= self._config.adapt_above:
                 self._fit_config = replace(self._config.fit, n_steps=0)
+                _log.info("The identified model misses %.2g of an increment: it stays, (FIT) finds the cost", missed)
         return found.table
 
     def _learn_value(self, table: TransitionTable, epoch: int) -> Iterator[Epoch]:

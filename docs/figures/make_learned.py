@@ -60,7 +60,7 @@ def log_and_value(table: TransitionTable, learner: OfflineMPCLearner) -> Figure:
     task, labels = task_of(PENDULUM)
     y, cost = table.observations.astype(np.float64), table.costs.astype(np.float64)
     angle, speed = np.mod(np.arctan2(y[:, 1], y[:, 0]), 2 * np.pi), y[:, 2]
-    assert learner.value_function is not None  # noqa: S101
+    assert learner.value_function is not None
     horizontal, vertical, value = on_plane(task, labels, learner.value_function.predict, 241)
     figure = new_figure(PAGE_WIDTH, 2.75)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -84,7 +84,7 @@ def log_and_value(table: TransitionTable, learner: OfflineMPCLearner) -> Figure:
 def fit_and_values(table: TransitionTable, learner: OfflineMPCLearner, before: str, after: str) -> Figure:
     """What (FIT) fits, and what the MPC then makes of it: before and after learning, each a point a transition."""
     value = learner.value_function
-    assert value is not None  # noqa: S101
+    assert value is not None
     figure = new_figure(PAGE_WIDTH, 3.0)
     left, right = figure.subplots(1, 2)
     V = value.predict(table.observations)
@@ -97,7 +97,7 @@ def fit_and_values(table: TransitionTable, learner: OfflineMPCLearner, before: s
         gap = np.sqrt(np.mean((theirs - V)[known] ** 2)) / V.std()
         share = np.mean((asked - stage) ** 2) / np.var(asked)
         figures = f"{share:.1%} of the variance is left by (FIT), V_theta - V is {gap:.1%} of the spread of V"
-        print(f"{name}: {figures}, {(~known).sum()} MPCs were not solved")  # noqa: T201
+        print(f"{name}: {figures}, {(~known).sum()} MPCs were not solved")
     diagonal(left, 13.0)
     left.set(title="(FIT): one dot a transition", xlabel="stage cost $\\hat L_\\theta(s,a)$")
     left.set_ylabel("$L + \\gamma V(s_+) - \\gamma V(f_\\theta(s,a))$")
@@ -117,7 +117,7 @@ def diagonal(axes: Axes, end: float) -> None:
 
 def regression(mpc: MPC, learner: OfflineMPCLearner, table: TransitionTable) -> tuple[Array, Array]:
     """Of (FIT): what the stage cost is asked to be, and what it is, each ``(n,)``."""
-    assert learner.value_function is not None  # noqa: S101
+    assert learner.value_function is not None
     problem = BellmanFit(mpc.replace(discount=learner.mpc.discount), learner.value_function, 1.0)
     columns, theta = table.columns(torch.from_numpy(np.array(table.rows))), torch.from_numpy(mpc.theta)
     with torch.no_grad():
@@ -143,7 +143,7 @@ def main() -> None:
     else:
         learner = OfflineMPCLearner.load(saved)
     for name, mpc in (("theta_0", learner.nominal_mpc), ("theta", learner.mpc)):
-        print(name, {key: np.round(array, 3).tolist() for key, array in mpc.values.items()})  # noqa: T201
+        print(name, {key: np.round(array, 3).tolist() for key, array in mpc.values.items()})
     seen, learned_from = some(table), some(table.trim(learner.config.trim))
     for theme, (*_, before, after) in COLORS.items():
         with themed(theme):

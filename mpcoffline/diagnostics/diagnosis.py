@@ -148,7 +148,7 @@ def _theorem(
 
 
 def _notes(report: Report, *, smoothed: bool) -> tuple[str, ...]:
-    """What explains the verdict or may spoil the next fit, with what to do; ``smoothed``: it began with that."""
+    """What explains the verdict or may spoil the next fit, with what to do; ``smoothed``: the fit did so, too."""
     notes = []
     if report.goal_share is not None and report.goal_share < _SCARCE_GOAL:
         notes.append("The log never reaches the goal: V is a guess there. Record episodes that end at the reference.")
