@@ -145,7 +145,7 @@ class Solver(ABC):
                     raise InvalidArgumentError(
                         f"warm_start.{name}", expected=f"shape {expected}", actual=f"shape {given.shape}"
                     )
-        solution = self._solve(states, parameters, imposed, plan or Plan.none(len(states), self.mpc))
+        solution = self._solve(states, parameters, imposed, plan)
         return solution.unbatched() if np.ndim(x) == 1 else solution
 
     def value(self, x: ArrayLike, theta: ArrayLike | None = None) -> Array:
@@ -159,8 +159,12 @@ class Solver(ABC):
         return np.where(solution.success, solution.value, np.inf)
 
     @abstractmethod
-    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
-        """Solves the batch; arguments are checked, ``x`` is ``(B, nx)``, theta ``(size,)`` or has B rows."""
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
+        """Solves the batch; arguments are checked, ``x`` is ``(B, nx)``, theta ``(size,)`` or has B rows.
+
+        Without any ``warm_start`` all problems are cold; making and looking through a plan that holds none would take
+        longer than some solvers do.
+        """
 
     def _checked_theta(self, theta: ArrayLike, n_problems: int) -> Array:
         array, space = np.asarray(theta, dtype=np.float64), self.mpc.space
@@ -200,4 +204,4 @@ def _checked(name: str, value: ArrayLike, size: int) -> Array:
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(np.atleast_2d(array)).all(axis=1))[0])
         raise InvalidArgumentError(name, expected="finite numbers", actual=f"{np.atleast_2d(array)[row]} in row {row}")
-    return np.atleast_2d(array)
+    return array if array.ndim == 2 else array[None]

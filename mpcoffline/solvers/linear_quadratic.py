@@ -244,7 +244,7 @@ class Riccati:
 
     def value(self, x: Array) -> Array:
         """V_0 of states ``(B, nx)``, ``(B,)``."""
-        return np.asarray(np.einsum("bi,ij,bj->b", x, self.P[0], x) + 2.0 * x @ self.p[0] + self.v[0])
+        return np.asarray(((x @ self.P[0] + 2.0 * self.p[0]) * x).sum(axis=1) + self.v[0])
 
     def residual(self, x: Array) -> Array:
         """A bound on :meth:`LinearQuadratic.optimality` of :meth:`trajectories`, ``(B,)``, at the cost of one product.

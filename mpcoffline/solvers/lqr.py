@@ -10,6 +10,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
@@ -64,15 +65,14 @@ class LQRSolver(Solver):
                 actual=reason,
                 hint='Use make_solver(mpc, "auto").',
             )
-        if cache_size < 1:
-            raise InvalidArgumentError("cache_size", expected="a positive integer", actual=str(cache_size))
+        check_integers(1, cache_size=cache_size)
         self._extraction = Extraction(mpc)
         self._low, self._high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
         self._cache: OrderedDict[bytes, _Controller] = OrderedDict()
         self._cache_size = cache_size
         self._ipopt: IpoptSolver | None = None
 
-    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
         if theta.ndim == 1:
             solution = self._solve_with(theta, x, u0, warm_start)
@@ -81,17 +81,17 @@ class LQRSolver(Solver):
         solution.stats["time"] = time.perf_counter() - start
         return solution
 
-    def _solve_each(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan) -> Solution:
+    def _solve_each(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         """Problems with thetas of their own, those with equal ones together."""
         _, group = np.unique(theta.reshape(len(theta), -1), axis=0, return_inverse=True)
         result = _empty(len(x), self.mpc)
         for k in range(group.max() + 1):
             rows = np.flatnonzero(group == k)
-            warm = Plan(warm_start.x[rows], warm_start.u[rows])
+            warm = _part(warm_start, rows)
             _put(result, rows, self._solve_with(theta[rows[0]], x[rows], None if u0 is None else u0[rows], warm))
         return result
 
-    def _solve_with(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan) -> Solution:
+    def _solve_with(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         """The problems of one theta, ``(size,)`` or ``(N + 1, size)``."""
         controller = self._controller(theta)
         if not controller.definite(u0 is not None):
@@ -99,12 +99,12 @@ class LQRSolver(Solver):
         solution = controller.solve(x, u0, warm_start)
         lost = np.flatnonzero(~solution.success)
         if len(lost):
-            warm = Plan(warm_start.x[lost], warm_start.u[lost])
+            warm = _part(warm_start, lost)
             reason = solution.status[lost[0]]
             _put(solution, lost, self._by_ipopt(theta, x[lost], None if u0 is None else u0[lost], warm, reason))
         return solution
 
-    def _by_ipopt(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan, reason: str) -> Solution:
+    def _by_ipopt(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan | None, reason: str) -> Solution:
         if self._ipopt is None:
             self._ipopt = IpoptSolver(self.mpc)
         every = theta if theta.ndim == 1 else theta[None]
@@ -142,7 +142,7 @@ class _Controller:
             self._rest = Riccati(self._problem.tail())
         return self._rest
 
-    def solve(self, x: Array, u0: Array | None, warm_start: Plan) -> Solution:
+    def solve(self, x: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         """The problems from ``x (B, nx)``; with ``u0 (B, nu)`` given, the rest of them from its successor."""
         problem, imposed = self._problem, u0 is not None
         riccati, skipped = self._riccati(imposed), int(imposed)
@@ -154,7 +154,7 @@ class _Controller:
         if len(rows):
             program, rest = self._program(imposed, riccati), riccati.problem
             for i in rows:
-                guess = warm_start.u[i, skipped:]
+                guess = None if warm_start is None else warm_start.u[i, skipped:]
                 inputs[i], iterations[i], status[i] = program.solve(inputs[i], guess)
             states[rows] = rest.rollout(begin[rows], inputs[rows])
             bounded = states[rows], inputs[rows]
@@ -199,16 +199,17 @@ class _BoundedInputs:
         self._data = (np.eye(n), np.zeros(n), np.ascontiguousarray(G), wide, -wide, np.zeros(n, dtype=np.intc))
         self._model.setup(*self._data)
 
-    def solve(self, u: Array, guess: Array) -> tuple[Array, int, str]:
+    def solve(self, u: Array, guess: Array | None) -> tuple[Array, int, str]:
         """The best inputs within the bounds ``(N, nu)``, iterations and status.
 
         Args:
             u: The inputs without bounds, ``(N, nu)``.
-            guess: Inputs of a plan ``(N, nu)``, whose active bounds are tried first; NaN for none.
+            guess: Inputs of a plan ``(N, nu)``, whose active bounds are tried first; None, or NaN, for none.
         """
         sense = np.zeros(u.size, dtype=np.intc)
-        sense[(guess >= self._high).ravel()] = _UPPER
-        sense[(guess <= self._low).ravel()] = _LOWER
+        if guess is not None:
+            sense[(guess >= self._high).ravel()] = _UPPER
+            sense[(guess <= self._low).ravel()] = _LOWER
         upper = np.minimum(self._high - u, _INFINITE).ravel()
         lower = np.maximum(self._low - u, -_INFINITE).ravel()
         self._model.update(bupper=upper, blower=lower, sense=sense)
@@ -219,6 +220,10 @@ class _BoundedInputs:
             reason = f"clipped Riccati, as daqp says {_REASONS.get(flag, flag)}"
             return np.clip(u, self._low, self._high), iterations, reason
         return np.clip(u + (self._G @ w).reshape(u.shape), self._low, self._high), iterations, "QP"
+
+
+def _part(plan: Plan | None, rows: NDArray[np.intp]) -> Plan | None:
+    return None if plan is None else Plan(plan.x[rows], plan.u[rows])
 
 
 def _empty(n: int, mpc: MPC) -> Solution:

@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
@@ -60,9 +61,7 @@ class IpoptSolver(Solver):
         super().__init__(mpc)
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
-        for name, value in (("max_iterations", max_iterations), ("n_workers", n_workers)):
-            if value < 1:
-                raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
+        check_integers(1, max_iterations=max_iterations, n_workers=n_workers)
         self._n_starts = n_starts or (1 if is_convex(mpc) else 4)
         self._options: dict[str, Any] = {
             "n_starts": self._n_starts,
@@ -84,8 +83,9 @@ class IpoptSolver(Solver):
         """The program of one theta a stage."""
         return _Program(self.mpc, self._candidates, **self._options, stagewise=True)
 
-    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
+        warm_start = warm_start or Plan.none(len(x), self.mpc)
         if self._pool is not None and len(x) > 1:
             found = self._pool.solve(x, theta, u0, warm_start)
         else:

@@ -102,7 +102,7 @@ static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
 }
 
 /* H = L D L' of a matrix, in place: 1/D on the diagonal, L below it. Clears lanes that are not positive definite. */
-static void factorise(vd H[NU][NU], vl *pd) {
+static inline void factorise(vd H[NU][NU], vl *pd) {
     for (int j = 0; j < NU; ++j) {
         vd scaled[NU], d = H[j][j]; /* row j of L, times D */
         for (int l = 0; l < j; ++l) {
@@ -119,7 +119,7 @@ static void factorise(vd H[NU][NU], vl *pd) {
 }
 
 /* b <- H^-1 b with the factors of H. */
-static void substitute(vd H[NU][NU], vd b[NU]) {
+static INLINE void substitute(vd H[NU][NU], vd b[NU]) {
     for (int i = 0; i < NU; ++i)
         for (int l = 0; l < i; ++l) b[i] -= H[i][l] * b[l];
     for (int i = NU - 1; i >= 0; --i) {

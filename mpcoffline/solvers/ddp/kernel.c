@@ -59,25 +59,33 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
         if (b->u0 && k < NU) low = high = b->u0[i * NU + k];
         w->u[k][lane] = v < low ? low : v > high ? high : v;
     }
-    for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
+    if (b->guess != INPUTS)
+        for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
     for (int j = 0; j < NX; ++j) w->x[j][lane] = w->s[j][lane];
     w->J[lane] = b->guess == ROLLOUT ? b->J[i] : INFINITY;
     w->mu[lane] = w->alpha[lane] = 0.0;
 }
 
+/* Whether no number has the exponent of infinities and NaNs; in integers, which compilers vectorise. */
+static int is_finite(const double *v, int64_t n) {
+    const uint64_t exponent = 0x7ff0000000000000u;
+    uint64_t found = 0;
+    for (int64_t k = 0; k < n; ++k) {
+        uint64_t bits;
+        memcpy(&bits, v + k, sizeof bits);
+        found |= (bits & exponent) == exponent;
+    }
+    return !found;
+}
+
 static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w, int lane, int64_t i, int64_t status,
                        int64_t iterations) {
-    int64_t N = m->horizon;
-    int finite = isfinite(w->J[lane]) != 0;
-    for (int64_t k = 0; k < N * NU; ++k) {
-        b->u[i * N * NU + k] = w->u[k][lane];
-        finite &= isfinite(w->u[k][lane]) != 0;
-    }
-    for (int64_t k = 0; k < (N + 1) * NX; ++k) {
-        b->x[i * (N + 1) * NX + k] = w->x[k][lane];
-        finite &= isfinite(w->x[k][lane]) != 0;
-    }
+    int64_t n_u = m->horizon * NU, n_x = (m->horizon + 1) * NX;
+    double *u = b->u + i * n_u, *x = b->x + i * n_x;
+    for (int64_t k = 0; k < n_u; ++k) u[k] = w->u[k][lane];
+    for (int64_t k = 0; k < n_x; ++k) x[k] = w->x[k][lane];
     b->J[i] = w->J[lane];
+    int finite = is_finite(b->J + i, 1) && is_finite(u, n_u) && is_finite(x, n_x);
     b->predicted[i] = w->predicted[lane];
     b->status[i] = finite ? status : NOT_FINITE;
     b->iterations[i] = iterations;
@@ -89,9 +97,7 @@ static int is_beaten(const lanes *w, int lane, double best) {
 }
 
 /* Solves problems first, first + stride, ... of the batch; a lane that finishes takes the next one. */
-static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t stride) {
-    lanes *w = lanes_new(m->horizon);
-    if (!w) return 1;
+static void solve_range(const mpc_problem *m, const mpc_batch *b, lanes *w, int64_t first, int64_t stride) {
     int64_t problem[LANES], count[LANES], next = first;
     int fresh_any, busy;
     double best = INFINITY;
@@ -137,8 +143,6 @@ static int solve_range(const mpc_problem *m, const mpc_batch *b, int64_t first, 
             }
         }
     }
-    lanes_free(w);
-    return 0;
 }
 
 /* Open-loop costs of n_candidates input sequences (a multiple of LANES) from one state; J (n_candidates). */
@@ -156,7 +160,11 @@ static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, co
 }
 
 int mpc_solve(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t stride) {
-    return solve_range(m, b, first, stride);
+    lanes *w = lanes_new(m->horizon);
+    if (!w) return 1;
+    solve_range(m, b, w, first, stride);
+    lanes_free(w);
+    return 0;
 }
 
 /* Takes the start of each share of the candidates, its cheapest one; shares of one need no comparison. */
@@ -185,11 +193,11 @@ static void swap(double *a, double *b, int64_t n) {
 }
 
 /* Moves the starts that a few iterations show to lead somewhere, and elsewhere, to the front. */
-static int race(const mpc_problem *m, mpc_batch *starts, int64_t *chosen, int64_t *iterations) {
+static void race(const mpc_problem *m, mpc_batch *starts, lanes *w, int64_t *chosen, int64_t *iterations) {
     int64_t N = m->horizon;
     mpc_problem short_one = *m;
     if (short_one.max_iterations > RACE_ITERATIONS) short_one.max_iterations = RACE_ITERATIONS;
-    if (solve_range(&short_one, starts, 0, 1)) return 1;
+    solve_range(&short_one, starts, w, 0, 1);
     for (int64_t l = 0; l < starts->n; ++l) {
         *iterations += starts->iterations[l];
         if (!(starts->J[l] < INFINITY)) starts->J[l] = INFINITY;
@@ -203,24 +211,23 @@ static int race(const mpc_problem *m, mpc_batch *starts, int64_t *chosen, int64_
         swap(starts->u + l * N * NU, starts->u + from * N * NU, N * NU);
         swap(starts->x + l * (N + 1) * NX, starts->x + from * (N + 1) * NX, (N + 1) * NX);
     }
-    return 0;
 }
 
 /* Cold solve of one problem. Each start is the cheapest of its share of the candidates, which keeps them different;
  * the best solution goes to row i of the batch. */
-static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
-                      int64_t n_candidates, double *J, lanes *w, mpc_batch *starts, int64_t *chosen) {
+static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
+                       int64_t n_candidates, double *J, lanes *w, mpc_batch *starts, int64_t *chosen) {
     int64_t N = m->horizon, best = 0, iterations = 0;
     starts->theta = b->theta + i * b->theta_stride;
     choose_starts(m, b, i, candidates, n_candidates, J, w, starts);
     mpc_batch finals = *starts;
     if (starts->n > 1) {
-        if (race(m, starts, chosen, &iterations)) return 1;
+        race(m, starts, w, chosen, &iterations);
         finals.n = FINALISTS(starts->n);
         finals.guess = ROLLOUT;
         finals.rivals = 1;
     }
-    if (solve_range(m, &finals, 0, 1)) return 1;
+    solve_range(m, &finals, w, 0, 1);
     for (int64_t l = 0; l < finals.n; ++l) {
         iterations += starts->iterations[l];
         /* A converged solution that is as good as the best goes before one that is not. */
@@ -236,7 +243,6 @@ static int solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const
     b->predicted[i] = starts->predicted[best];
     b->status[i] = starts->status[best];
     b->iterations[i] = iterations;
-    return 0;
 }
 
 int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candidates, int64_t n_candidates,
@@ -255,8 +261,8 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
         starts.u0 = b->u0 ? q : NULL; q += n_starts * NU;
         starts.J = q; q += n_starts;
         starts.predicted = q;
-        for (int64_t i = first; i < b->n && !failed; i += stride)
-            failed = solve_cold(m, b, i, candidates, n_candidates, memory, w, &starts, flags + 2 * n_starts);
+        for (int64_t i = first; i < b->n; i += stride)
+            solve_cold(m, b, i, candidates, n_candidates, memory, w, &starts, flags + 2 * n_starts);
     }
     lanes_free(w);
     free(memory);

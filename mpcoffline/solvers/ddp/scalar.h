@@ -6,6 +6,7 @@ typedef int vl;
 
 #define V(a) ((vd)(a))
 #define NOINLINE
+#define INLINE inline
 #define vl_any(mask) (mask)
 static inline vd vd_select(vl mask, vd a, vd b) { return mask ? a : b; }
 static inline vl vd_lt(vd a, vd b) { return -(a < b); }

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import ctypes
-import functools
-import math
 import time
 from concurrent.futures import ThreadPoolExecutor
-from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
-from itertools import pairwise
+from ctypes import POINTER, c_char, c_double, c_int, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import Array, Plan, Solution, Solver
@@ -109,9 +107,7 @@ class DDPSolver(Solver):
                 actual="constraints",
                 hint="Use ipopt.",
             )
-        for name, value in (("max_iterations", max_iterations), ("n_threads", n_threads)):
-            if value < 1:
-                raise InvalidArgumentError(name, expected="a positive integer", actual=str(value))
+        check_integers(1, max_iterations=max_iterations, n_threads=n_threads)
         if n_starts is None:
             n_starts = 1 if is_convex(mpc) else 16
         if not 1 <= n_starts <= N_CANDIDATES:
@@ -130,28 +126,29 @@ class DDPSolver(Solver):
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
 
-    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> Solution:
+    def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
-        known = warm_start.known
-        n_known = np.count_nonzero(known)
-        if n_known == len(x):
-            result = self._run(x, theta, u0, warm_start)
-        elif n_known == 0:
-            result = self._run(x, theta, u0, None)
-        else:
-            result = self._run_mixed(x, theta, u0, warm_start, known)
-        # A warm start can lead nowhere; such a problem gets the cold solve that it would have had without.
-        lost = known & (result["status"] > 1)
-        if np.count_nonzero(lost):
-            again = self._run(x[lost], _rows(theta, lost), None if u0 is None else u0[lost], None)
-            for name, array in again.items():
-                result[name][lost] = array
+        result = self._run(x, theta, u0, None) if warm_start is None else self._run_warm(x, theta, u0, warm_start)
         status = result["status"]
         stats: dict[str, Any] = {"iterations": result["iterations"], "time": time.perf_counter() - start}
         stats["predicted_decrease"] = result["predicted"]
         success = (status == 0) & np.isfinite(result["J"])
         words = [_STATUS[code] for code in status.tolist()]
         return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], success, words, stats)
+
+    def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
+        """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""
+        known = plan.known
+        n_known = np.count_nonzero(known)
+        if n_known == 0:
+            return self._run(x, theta, u0, None)
+        result = self._run(x, theta, u0, plan) if n_known == len(x) else self._run_mixed(x, theta, u0, plan, known)
+        lost = known & (result["status"] > 1)
+        if np.count_nonzero(lost):
+            again = self._run(x[lost], _rows(theta, lost), None if u0 is None else u0[lost], None)
+            for name, array in again.items():
+                result[name][lost] = array
+        return result
 
     def _run_mixed(
         self, x: Array, theta: Array, u0: Array | None, plan: Plan, known: NDArray[np.bool_]
@@ -167,23 +164,42 @@ class DDPSolver(Solver):
     def _run(self, x: Array, theta: Array, u0: Array | None, plan: Plan | None) -> dict[str, NDArray[Any]]:
         """Calls the kernel; warm with a plan, cold without."""
         n, mpc = len(x), self.mpc
-        block, address = _block(n, mpc.horizon, mpc.nx, mpc.nu)
-        block["x0"][:] = x
-        theta = np.ascontiguousarray(theta)  # one for all, or a row a problem
-        if u0 is None:
-            address["u0"] = None
-        else:
-            block["u0"][:] = u0
-        guess: dict[str, int | None] = {"x_guess": address["x"], "u_guess": address["u"]}
+        # What the kernel reads; named here, so that it lives as long.
+        x, theta = _plain(x), _plain(theta)  # one theta for all, or a row a problem
+        u0 = None if u0 is None else _plain(u0)
+        # What it writes, in one piece of memory: for one problem, allocations would take long.
+        n_x, n_u = n * (mpc.horizon + 1) * mpc.nx, n * mpc.horizon * mpc.nu
+        memory = np.empty(n_x + n_u + 4 * n)
+        reached = _address(memory)
+        inputs, figures, row = reached + 8 * n_x, reached + 8 * (n_x + n_u), 8 * n
+        batch = _Batch(
+            n=n,
+            x0=_address(x),
+            theta=_address(theta),
+            u0=None if u0 is None else _address(u0),
+            theta_stride=theta.shape[1] if theta.ndim == 2 else 0,
+            x=reached,
+            u=inputs,
+            J=figures,
+            predicted=figures + row,
+            iterations=figures + 2 * row,
+            status=figures + 3 * row,
+        )
         if plan is not None:
-            kept = [np.ascontiguousarray(a, np.float64) for a in plan]  # as long as the kernel reads them
-            guess = {"x_guess": kept[0].ctypes.data, "u_guess": kept[1].ctypes.data}
-        stride = theta.shape[1] if theta.ndim == 2 else 0
-        batch = _Batch(n=n, theta=theta.ctypes.data, theta_stride=stride, **guess, **address)
-        failed = self._call(batch, cold=plan is None)
-        if failed:
+            plan = Plan(_plain(plan.x), _plain(plan.u))
+            batch.x_guess, batch.u_guess = _address(plan.x), _address(plan.u)
+        if self._call(batch, cold=plan is None):
             raise MemoryError(f"solving {n} MPCs: the kernel could not allocate its work space")
-        return {name: block[name] for name in ("x", "u", "J", "predicted", "iterations", "status")}
+        values = memory[n_x + n_u :].reshape(4, n)
+        integers = values.view(np.int64)
+        return {
+            "x": memory[:n_x].reshape(n, mpc.horizon + 1, mpc.nx),
+            "u": memory[n_x : n_x + n_u].reshape(n, mpc.horizon, mpc.nu),
+            "J": values[0],
+            "predicted": values[1],
+            "iterations": integers[2],
+            "status": integers[3],
+        }
 
     def _call(self, batch: _Batch, *, cold: bool) -> int:
         """Runs the kernel on a batch, in several threads if there are; returns how many failed."""
@@ -207,34 +223,13 @@ def _rows(theta: Array, chosen: NDArray[np.bool_]) -> Array:
     return theta[chosen] if theta.ndim == 2 else theta
 
 
-@functools.lru_cache(maxsize=64)
-def _layout(n: int, horizon: int, nx: int, nu: int) -> tuple[tuple[tuple[str, slice, tuple[int, ...]], ...], int]:
-    """Name, place and shape of the arrays of n problems in one piece of memory, and its size in numbers of 8 bytes."""
-    shapes = {
-        "x": (n, horizon + 1, nx),
-        "u": (n, horizon, nu),
-        "J": (n,),
-        "predicted": (n,),
-        "x0": (n, nx),
-        "u0": (n, nu),
-        "iterations": (n,),
-        "status": (n,),
-    }
-    ends = np.cumsum([math.prod(shape) for shape in shapes.values()]).tolist()
-    places = (slice(start, end) for start, end in pairwise([0, *ends]))
-    return tuple((name, place, shape) for (name, shape), place in zip(shapes.items(), places, strict=True)), ends[-1]
+def _plain(array: Array) -> Array:
+    """An array as C and :func:`_address` take it: contiguous and writable."""
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    return array if array.flags.writeable else array.copy()
 
 
-def _block(n: int, horizon: int, nx: int, nu: int) -> tuple[dict[str, NDArray[Any]], dict[str, int | None]]:
-    """Arrays in one piece of memory, and their addresses: for one problem, allocations would take long."""
-    layout, size = _layout(n, horizon, nx, nu)
-    memory = np.empty(size)
-    integers = memory.view(np.int64)
-    start = memory.ctypes.data
-    arrays: dict[str, NDArray[Any]] = {}
-    addresses: dict[str, int | None] = {}
-    for name, place, shape in layout:
-        whole = integers if name in ("iterations", "status") else memory
-        arrays[name] = whole[place].reshape(shape)
-        addresses[name] = start + 8 * place.start
-    return arrays, addresses
+def _address(array: NDArray[Any]) -> int:
+    """Where the first number of an array is; three times faster than ``array.ctypes.data``."""
+    buffer: Any = array  # that arrays are buffers is in numpy's types from Python 3.12 on
+    return ctypes.addressof(c_char.from_buffer(buffer)) if array.size else 0

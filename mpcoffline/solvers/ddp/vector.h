@@ -13,6 +13,7 @@ typedef double vd __attribute__((vector_size(8 * LANES)));
 typedef long long vl __attribute__((vector_size(8 * LANES)));
 
 #define NOINLINE __attribute__((noinline))
+#define INLINE inline __attribute__((always_inline))
 
 static inline vd V(double a) { return a - (vd){0}; }
 static inline vd vd_select(vl mask, vd a, vd b) { return (vd)((mask & (vl)a) | (~mask & (vl)b)); }
@@ -23,6 +24,9 @@ static inline vd vd_min(vd a, vd b) { return vd_select(a < b, a, b); }
 static inline vd vd_max(vd a, vd b) { return vd_select(a > b, a, b); }
 static inline vd vd_abs(vd a) { return vd_select(a < 0.0, -a, a); }
 static inline int vl_any(vl mask) {
+#if defined(__AVX__) && LANES == 4 /* one instruction instead of a dozen */
+    return !__builtin_ia32_ptestz256(mask, mask);
+#endif
     long long any = 0;
     for (int l = 0; l < LANES; ++l) any |= mask[l];
     return any != 0;
