@@ -129,6 +129,12 @@ class Fit:
             if self._config.fit.n_steps and missed <= self._config.adapt_above:
                 self._fit_config = replace(self._config.fit, n_steps=0)
                 _log.info("The identified model misses %.2g of an increment: it stays, (FIT) finds the cost", missed)
+            elif self._config.fit.n_steps:
+                _log.info(
+                    "The identified model misses %.2g of an increment: is its structure the plant's? (FIT) adapts it "
+                    "with the cost; the larger horizon and discount are, the more an MPC relies on it",
+                    missed,
+                )
         return found.table
 
     def _learn_value(self, table: TransitionTable, epoch: int) -> Iterator[Epoch]:

@@ -126,6 +126,7 @@ PRESETS: dict[str, LearnerConfig] = {
     "default": _DEFAULT,
     # The same at a third of the horizon, which leaves more to the terminal cost: it has to be closer to V.
     "fast": replace(_DEFAULT, horizon=10, terminal_blend=0.25),
-    # The same at the long horizon.
-    "best": replace(_DEFAULT, horizon=50),
+    # Looking farther ahead, by V and by the plan: better wherever the model can become the plant, and more at the
+    # mercy of its errors where it cannot. The larger discount gives V more to bridge, so it learns for longer.
+    "best": replace(_DEFAULT, horizon=50, least_discount=0.97, value=replace(_DEFAULT.value, n_steps=6_000)),
 }

@@ -542,13 +542,17 @@ def test_a_policys_file_is_not_a_learner(tmp_path: Path) -> None:
     assert (tmp_path / "p.zip").read_bytes() == before
 
 
-def test_an_identified_model_that_predicts_well_is_left_alone() -> None:
+def test_an_identified_model_that_predicts_well_is_left_alone(caplog: pytest.LogCaptureFixture) -> None:
     """The plant is in the model's family here; adapting begins where the error is above the limit."""
     table = lq_plant.random_log(600)
     options: dict[str, Any] = {"init": "identified", "fit_n_steps": 50, "hidden": (16, 16), "value_n_steps": 60}
     kept = quick(**(options | {"adapt_above": 0.03}))
+    caplog.set_level("INFO")
     kept.fit(table, show_progress=False)
     np.testing.assert_allclose(kept.mpc.values["model.A"], lq_plant.A, atol=1e-3)
+    assert "it stays" in caplog.text
+    caplog.clear()
     adapted = quick(**(options | {"adapt_above": 0.0}))
     adapted.fit(table, show_progress=False)
+    assert "(FIT) adapts it with the cost" in caplog.text
     assert len(adapted.history) > len(kept.history)  # the steps on cost and model, though they may end where they began

@@ -37,11 +37,14 @@ def test_the_paper_preset_changes_nothing_of_the_mpc() -> None:
     assert PRESETS["paper"].init == "nominal"
 
 
-@pytest.mark.parametrize(("given", "discount"), [(0.9, 0.95), (0.97, 0.97)])
-def test_the_other_presets_have_a_least_discount(given: float, discount: float) -> None:
+@pytest.mark.parametrize(
+    ("preset", "given", "discount"),
+    [("default", 0.9, 0.95), ("default", 0.97, 0.97), ("fast", 0.9, 0.95), ("best", 0.95, 0.97), ("best", 0.99, 0.99)],
+)
+def test_the_other_presets_have_a_least_discount(preset: str, given: float, discount: float) -> None:
     mpc = make_mpc().replace(discount=given)
-    assert restructured(mpc, PRESETS["default"]).discount == discount
-    assert restructured(mpc, PRESETS["default"].replaced({"discount": 0.8})).discount == 0.8
+    assert restructured(mpc, PRESETS[preset]).discount == discount
+    assert restructured(mpc, PRESETS[preset].replaced({"discount": 0.8})).discount == 0.8
     assert mpc.discount == given
 
 
