@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from os import PathLike
 from pathlib import Path
@@ -15,6 +16,8 @@ from mpcoffline.mpc import MPC
 from mpcoffline.policy import MPCPolicy
 from mpcoffline.solvers import DDPSolver, starts
 from mpcoffline.solvers.ddp.codegen import generated, text
+
+_log = logging.getLogger(__name__)
 
 _EPISODES, _STEPS = 4, 20
 # How a start of the test vectors is chosen, see _unambiguous_starts.
@@ -130,6 +133,10 @@ def _vectors(policy: MPCPolicy) -> str:
             state = solution.plan.shifted()
             lines.append(" ".join([str(int(step == 0)), *(_number(v) for v in (*y, *solution.u0))]))
             y = mpc.model(y, solution.u0)
+    if not lines:
+        _log.warning(
+            "No test vectors: of %d starts each was unsolved or had plans that are as good as its own.", _DRAWS
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -255,7 +262,11 @@ int main(int argc, char **argv) {
         ++steps;
     }
     fclose(file);
-    int passed = steps > 0 && !unsolved && worst <= 1e-6;
+    if (!steps) {
+        printf("no test vectors: nothing was tested\\n");
+        return 2;
+    }
+    int passed = !unsolved && worst <= 1e-6;
     printf("%d steps, %d not solved, largest relative difference %.3g (at most 1e-6): %s\\n", steps, unsolved, worst,
            passed ? "passed" : "FAILED");
     return passed ? 0 : 1;

@@ -104,6 +104,11 @@ class OfflineMPCLearner:
         self._observation_space: spaces.Box | None = None
         self._policy: MPCPolicy | None = None
 
+    def __repr__(self) -> str:
+        """What it learns, how, and whether it has."""
+        state = "fitted" if self.result is not None else "not fitted"
+        return f"{type(self).__name__}(learn={self.learn!r}, preset={self.preset!r}, seed={self.seed}; {state})"
+
     def fit(
         self,
         dataset: MinariDataset | TransitionTable | str,

@@ -52,6 +52,18 @@ def test_the_c_code_replays_its_vectors(case: str, tmp_path: Path) -> None:
     assert int(steps[1]) >= 40
 
 
+def test_without_vectors_nothing_is_said_to_pass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("mpcoffline.export._unambiguous_starts", lambda policy: [])
+    export_c(MPCPolicy(mpc_of(LINEAR)), tmp_path)
+    assert "No test vectors" in caplog.text
+    done = subprocess.run(
+        [compiled(tmp_path), tmp_path / "test_vectors.txt"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "no test vectors: nothing was tested\n")
+
+
 MAIN = """
 #include <stdio.h>
 #include "mpc_controller.h"

@@ -24,6 +24,11 @@ class Component:
 
     space: ParameterSpace
 
+    def __repr__(self) -> str:
+        """Its class and parameters with their shapes."""
+        blocks = (f"{block.name} {block.shape}" if block.shape else block.name for block in self.space)
+        return f"{type(self).__name__}({', '.join(blocks)})"
+
     def with_theta(self, theta: Array) -> Self:
         """A copy with other parameter values, from this component's part of theta ``(size,)``."""
         other = copy.copy(self)

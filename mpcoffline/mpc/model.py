@@ -78,6 +78,13 @@ class Model(Component):
         try:
             reached = f(x) if discrete else rk4_expression(f, x, self.dt)
             function = ca.Function("model", [x, u, theta], [ca.cse(reached)], ["x", "u", "p"], ["x_next"])
+        except KeyError as error:
+            raise InvalidArgumentError(
+                "dynamics",
+                expected=f"parameters {', '.join(block.name for block in self.space) or 'none'}",
+                actual=f"p[{error}]",
+                hint="Give each parameter a name and a value in parameters.",
+            ) from error
         except (TypeError, NotImplementedError, RuntimeError) as error:
             raise InvalidArgumentError(
                 "dynamics",

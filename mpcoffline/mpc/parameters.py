@@ -207,6 +207,10 @@ class ParameterSpace(Sequence[Block]):
             start += block.size
         self.size = start
 
+    def __repr__(self) -> str:
+        """Its class, its blocks, and the size of theta."""
+        return f"{type(self).__name__}({', '.join(block.name for block in self)}; size {self.size})"
+
     def __len__(self) -> int:
         return len(self.blocks)
 

@@ -71,8 +71,8 @@ class Solution:
     """
 
     u0: Array
-    x: Array
-    u: Array
+    x: Array = field(repr=False)
+    u: Array = field(repr=False)
     value: Array
     success: NDArray[np.bool_]
     status: list[str] = field(repr=False)
@@ -109,6 +109,10 @@ class Solver(ABC):
     def __init__(self, mpc: MPC) -> None:
         self.mpc = mpc
         self._theta = mpc.theta
+
+    def __repr__(self) -> str:
+        """Its class and the sizes of its problem."""
+        return f"{type(self).__name__}(nx={self.mpc.nx}, nu={self.mpc.nu}, horizon={self.mpc.horizon})"
 
     def solve(
         self,

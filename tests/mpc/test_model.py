@@ -134,8 +134,12 @@ def test_dynamics_of_the_wrong_shape() -> None:
 
 
 def test_a_name_that_is_no_parameter() -> None:
-    with pytest.raises(KeyError, match="mass"):
+    with pytest.raises(InvalidArgumentError, match=r"dynamics: expected parameters m, got p\['mass'\]"):
         Model(lambda x, u, p: x / p["mass"], 2, 1, 0.1, {"m": 1.0})
+
+
+def test_it_names_its_parameters() -> None:
+    assert repr(Model(lambda x, u, p: p["A"] @ x, 2, 1, 0.1, {"A": np.eye(2), "m": 1.0})) == "Model(A (2, 2), m)"
 
 
 def test_json_roundtrip_bit_for_bit() -> None:

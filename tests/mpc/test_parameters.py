@@ -233,3 +233,8 @@ def test_values_handed_out_are_copies() -> None:
     space[0].value[:] = 9.0
     space.unpack(space.theta)["v"][:] = 9.0
     np.testing.assert_array_equal(space.theta, [1.0, 2.0])
+
+
+def test_the_space_names_its_blocks() -> None:
+    space = ParameterSpace([Block.free("A", np.eye(2), "model"), Block.free("b", 1.0, "model")])
+    assert repr(space) == "ParameterSpace(A, b; size 5)"

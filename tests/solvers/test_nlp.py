@@ -332,6 +332,8 @@ def test_a_solution_is_a_warm_start() -> None:
     solver = solver_of(PENDULUM, 10)
     x = states_of(PENDULUM, 2)
     batch, one = solver.solve(x), solver.solve(x[0])
+    assert repr(solver) == "IpoptSolver(nx=3, nu=1, horizon=10)"
+    assert repr(one) == f"Solution(u0={one.u0!r}, value={one.value!r}, success={one.success!r})"
     again = solver.solve(x, warm_start=batch)
     np.testing.assert_allclose(again.value, batch.value, rtol=1e-6)
     assert solver.solve(x[0], warm_start=one).value == pytest.approx(one.value, rel=1e-6)
