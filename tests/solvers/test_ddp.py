@@ -310,6 +310,30 @@ def test_a_plan_that_leads_nowhere_costs_nothing_but_time() -> None:
         check(solver, x, solution)
 
 
+def test_a_plan_with_holes_is_none() -> None:
+    solver = solver_of(PENDULUM, 20)
+    x = random_states(PENDULUM, 4)
+    cold = solver.solve(x)
+    states, inputs = cold.x.copy(), cold.u.copy()
+    states[0, 7, 1] = inputs[1, 0] = inputs[2, 9] = np.nan
+    holed = solver.solve(x, warm_start=Plan(states, inputs))
+    np.testing.assert_array_equal(holed.u[:3], cold.u[:3])
+    np.testing.assert_allclose(holed.value, cold.value, rtol=1e-9)
+    assert holed.success.all()
+
+
+def test_plans_and_states_may_be_read_only() -> None:
+    solver = solver_of(PENDULUM, 20)
+    x = random_states(PENDULUM, 3)
+    cold = solver.solve(x)
+    warm = solver.solve(x, warm_start=cold.plan)
+    for array in (x, *cold.plan):
+        array.flags.writeable = False
+    np.testing.assert_array_equal(solver.solve(x, warm_start=cold.plan).u, warm.u)
+    spread = np.broadcast_to(solver.mpc.theta, (3, solver.mpc.space.size))
+    np.testing.assert_array_equal(solver.solve(x[::-1], spread).u[::-1], cold.u)
+
+
 def test_the_callers_arrays_are_left_alone() -> None:
     solver = solver_of(PENDULUM)
     x = random_states(PENDULUM, 4)

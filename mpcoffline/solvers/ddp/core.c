@@ -128,10 +128,29 @@ static INLINE void substitute(vd H[NU][NU], vd b[NU]) {
     }
 }
 
+/* The first pass of box_qp as it is where no bound is in any lane's way, without its masks; returns whether it was. */
+static inline int unbounded_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high[NU], vd d[NU],
+                               vl is_free[NU], vd F[NU][NU]) {
+    vl definite = all_lanes(), bound = no_lanes();
+    for (int i = 0; i < NU; ++i) {
+        d[i] = -g[i];
+        is_free[i] = all_lanes();
+        for (int j = 0; j < NU; ++j) F[i][j] = H[i][j];
+    }
+    factorise(F, &definite);
+    substitute(F, d);
+    for (int i = 0; i < NU; ++i) {
+        bound |= (vd_le(V(0.0), low[i]) & vd_lt(V(0.0), g[i])) | (vd_le(high[i], V(0.0)) & vd_lt(g[i], V(0.0)));
+        bound |= vd_lt(d[i], low[i]) | vd_lt(high[i], d[i]);
+    }
+    return !vl_any(bound | ~definite);
+}
+
 /* min q(d) = 1/2 d'Hd + g'd, low <= d <= high (low <= 0 <= high) by projected Newton steps from d = 0. Returns which
  * inputs are free of their bounds and the factors of that part of H (identity elsewhere). */
 static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high[NU], vd d[NU], vl is_free[NU],
                    vd F[NU][NU], vl *pd) {
+    if (NU > 1 && unbounded_qp(H, g, low, high, d, is_free, F)) return;
     vl finished = no_lanes(), definite = all_lanes();
     for (int i = 0; i < NU; ++i) d[i] = V(0.0);
     for (int pass = 0; pass < 4 * NU + 4; ++pass) {
@@ -157,10 +176,6 @@ static void box_qp(vd H[NU][NU], const vd g[NU], const vd low[NU], const vd high
         }
         if (NU == 1) { /* clipping the minimiser of a parabola gives the constrained one */
             d[0] = trial[0];
-            break;
-        }
-        if (!pass && !vl_any(any_bound | clipped | ~definite)) { /* the minimum without bounds, in all lanes */
-            for (int i = 0; i < NU; ++i) d[i] = trial[i];
             break;
         }
         /* Halve the step, along its projection, until q falls enough. */

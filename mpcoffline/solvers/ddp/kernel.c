@@ -54,10 +54,13 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
         w->low0[a][lane] = b->u0 ? b->u0[i * NU + a] : m->low[a];
         w->high0[a][lane] = b->u0 ? b->u0[i * NU + a] : m->high[a];
     }
-    for (int64_t k = 0; k < N * NU; ++k) {
-        double v = b->u_guess[i * N * NU + k], low = m->low[k % NU], high = m->high[k % NU];
-        if (b->u0 && k < NU) low = high = b->u0[i * NU + k];
-        w->u[k][lane] = v < low ? low : v > high ? high : v;
+    for (int a = 0; a < NU; ++a) {
+        double low = m->low[a], high = m->high[a];
+        for (int64_t k = a; k < N * NU; k += NU) {
+            double v = b->u_guess[i * N * NU + k];
+            w->u[k][lane] = v < low ? low : v > high ? high : v;
+        }
+        if (b->u0) w->u[a][lane] = b->u0[i * NU + a];
     }
     if (b->guess != INPUTS)
         for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
