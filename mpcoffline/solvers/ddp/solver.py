@@ -123,6 +123,7 @@ class DDPSolver(Solver):
         )
         compared = n_starts if is_convex(mpc) else N_CANDIDATES  # any start leads to the only minimum
         self._candidates = np.ascontiguousarray(candidate_inputs(mpc)[:compared])
+        self._starts = _address(self._candidates), len(self._candidates), n_starts
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
 
@@ -132,9 +133,8 @@ class DDPSolver(Solver):
         status = result["status"]
         stats: dict[str, Any] = {"iterations": result["iterations"], "time": time.perf_counter() - start}
         stats["predicted_decrease"] = result["predicted"]
-        success = (status == 0) & np.isfinite(result["J"])
-        words = [_STATUS[code] for code in status.tolist()]
-        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], success, words, stats)
+        words = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
+        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], status == 0, words, stats)
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""
@@ -209,8 +209,7 @@ class DDPSolver(Solver):
         def work(first: int) -> int:
             if not cold:
                 return int(library.mpc_solve(problem, arguments, first, workers))
-            starts = self._candidates.ctypes.data, len(self._candidates), self.n_starts
-            return int(library.mpc_solve_cold(problem, arguments, *starts, first, workers))
+            return int(library.mpc_solve_cold(problem, arguments, *self._starts, first, workers))
 
         if workers == 1:
             return work(0)
