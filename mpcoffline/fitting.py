@@ -131,9 +131,10 @@ class Fit:
                 _log.info("The identified model misses %.2g of an increment: it stays, (FIT) finds the cost", missed)
             elif self._config.fit.n_steps:
                 _log.info(
-                    "The identified model misses %.2g of an increment: is its structure the plant's? (FIT) adapts it "
-                    "with the cost; the larger horizon and discount are, the more an MPC relies on it",
+                    "The identified model misses %.2g of an increment, adapt_above is %g: (FIT) adapts it with the "
+                    "cost. The larger horizon and discount are, the more an MPC relies on its model",
                     missed,
+                    self._config.adapt_above,
                 )
         return found.table
 

@@ -223,6 +223,7 @@ class _BoundedInputs:
 
 
 def _part(plan: Plan | None, rows: NDArray[np.intp]) -> Plan | None:
+    """The plans of some problems."""
     return None if plan is None else Plan(plan.x[rows], plan.u[rows])
 
 

@@ -138,7 +138,7 @@ class DDPSolver(Solver):
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""
-        known = np.isfinite(plan.u[:, 0, 0])  # faster than plan.known; one that ends in NaN leads nowhere
+        known = np.isfinite(plan.u[:, 0, 0])  # faster than plan.known; NaN elsewhere leads nowhere
         n_known = np.count_nonzero(known)
         if n_known == 0:
             return self._run(x, theta, u0, None)

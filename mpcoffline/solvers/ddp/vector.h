@@ -26,10 +26,11 @@ static inline vd vd_abs(vd a) { return vd_select(a < 0.0, -a, a); }
 static inline int vl_any(vl mask) {
 #if defined(__AVX__) && LANES == 4 /* one instruction instead of a dozen */
     return !__builtin_ia32_ptestz256(mask, mask);
-#endif
+#else
     long long any = 0;
     for (int l = 0; l < LANES; ++l) any |= mask[l];
     return any != 0;
+#endif
 }
 static inline vd vd_bool(vl mask) { return vd_select(mask, V(1.0), V(0.0)); }
 
