@@ -24,3 +24,18 @@ def check_limit(name: str, what: str, found: int, limit: int, *, hint: str = "")
     """
     if found > limit:
         raise FileFormatError(name, expected=f"at most {limit} {what}", actual=str(found), hint=hint)
+
+
+# Data sets: what is read of Minari's folders, of packed files and of table caches.
+METADATA_BYTES = 8 << 20  # of metadata.json; the bounds of a space of images take half a megabyte
+MANIFEST_BYTES = 1 << 20  # of SHA256SUMS
+TABLE_META_BYTES = 16 << 20  # of a cached table's table.json: a terabyte of rows has that many checksums
+SPACE_ELEMENTS = 1_000_000  # of a space: the numbers of its bounds
+SPACE_DEPTH = 16  # of spaces within spaces
+EPISODE_BYTES = 64  # of an HDF5 file, at least, for each episode that is declared
+LINK_BYTES = 16  # of an HDF5 file, at least, for each member of a group
+GROUP_DEPTH = 16  # of groups within groups of an HDF5 file
+EXPANSION = 100  # bytes of all arrays for each byte of their file, beyond the allowance: measured data reach 20
+EXPANSION_ALLOWANCE = 64 << 20  # bytes
+FOLDER_ENTRIES = 1_000_000  # files and folders of a data set
+HOLES = 1000  # bytes that a file claims for each one that it occupies on the disk

@@ -13,10 +13,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from mpcoffline.core.files import check_regular, read_limited
+from mpcoffline.core.limits import MANIFEST_BYTES
 from mpcoffline.errors import FileFormatError
 
 MANIFEST = "SHA256SUMS"
-MAX_BYTES = 1 << 20
 _LINE = re.compile(r"([0-9a-f]{64})  ([^\\\x00-\x1f]+)")
 
 
@@ -39,7 +40,12 @@ class Difference:
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a file as 64 hexadecimal digits, read in blocks."""
+    """The sha256 of a file as 64 hexadecimal digits, read in blocks.
+
+    Raises:
+        FileFormatError: For what is no regular file.
+    """
+    check_regular(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -75,9 +81,7 @@ def read_manifest(folder: Path) -> dict[str, str]:
         FileNotFoundError: Where there is none.
     """
     path = folder / MANIFEST
-    if path.stat().st_size > MAX_BYTES:
-        raise FileFormatError(str(path), expected=f"at most {MAX_BYTES} bytes", actual=str(path.stat().st_size))
-    return parse_manifest(path.read_bytes(), str(path))
+    return parse_manifest(read_limited(path, MANIFEST_BYTES), str(path))
 
 
 def parse_manifest(content: bytes, name: str = MANIFEST) -> dict[str, str]:

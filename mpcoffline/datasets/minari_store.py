@@ -12,19 +12,21 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError, UnknownIdError
 
 from .atomic import publish, sync_tree
+from .ids import GRAMMAR, is_valid_id
 from .manifest import write_manifest
+from .opening import open_dataset, read_metadata
 from .recipes import TASKS, Recipe, catalog_file
 
 if TYPE_CHECKING:
@@ -32,7 +34,6 @@ if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 RECORDING = "mpcoffline_recording"
-GRAMMAR = "(namespace/)*name-vN of letters, digits, '-' and '_' (no dots; a namespace has two characters or more)"
 
 
 @dataclass(frozen=True)
@@ -68,11 +69,9 @@ def load_dataset(dataset_id: str, *, download: bool = True) -> MinariDataset:
         FileFormatError: For a damaged data set, or a shipped file that does not have its sha256.
         RemoteError: Where the remote does not answer.
     """
-    import minari
-
     if is_valid_id(dataset_id):
         if is_local(dataset_id):
-            return _load_local(dataset_id)
+            return open_dataset(dataset_path(dataset_id))
         if dataset_id in shipped_datasets():
             return _materialise(dataset_id, shipped_datasets()[dataset_id])
         if download:
@@ -80,7 +79,7 @@ def load_dataset(dataset_id: str, *, download: bool = True) -> MinariDataset:
 
             if find_source(dataset_id) is not None:
                 return download_dataset(dataset_id)
-    known = sorted({*minari.list_local_datasets(), *shipped_datasets()})
+    known = sorted({*local_datasets(), *shipped_datasets()})
     nearest = difflib.get_close_matches(str(dataset_id), known, n=3, cutoff=0.4)
     hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}? " if nearest else ""
     raise UnknownIdError.of(
@@ -90,19 +89,57 @@ def load_dataset(dataset_id: str, *, download: bool = True) -> MinariDataset:
 
 def list_datasets() -> list[DatasetRow]:
     """All data sets that :func:`load_dataset` can give, sorted by id."""
-    import minari
-
     from .packed import packed_size
 
     rows = {
-        name: DatasetRow(name, "local", int(metadata["total_episodes"]), int(metadata["total_steps"]))
-        for name, metadata in minari.list_local_datasets().items()
+        name: DatasetRow(name, "local", metadata["total_episodes"], metadata["total_steps"])
+        for name, metadata in local_datasets().items()
     }
     for name, file in shipped_datasets().items():
         if name not in rows:
             with importlib.resources.as_file(catalog_file(file)) as path:
                 rows[name] = DatasetRow(name, "shipped", *packed_size(path))
     return [rows[name] for name in sorted(rows)]
+
+
+def local_datasets() -> dict[str, dict[str, Any]]:
+    """The data sets of the local store: id to metadata, sorted by id.
+
+    Minari's own list fails as a whole where one folder has a name or metadata that it does not expect; here such a
+    folder is left out, with a warning, and hides none of the others.
+    """
+    found = {}
+    for dataset_id in sorted(_stored_ids(dataset_path(""), "", set())):
+        try:
+            metadata = read_metadata(dataset_path(dataset_id))
+            if metadata["dataset_id"] != dataset_id:
+                raise FileFormatError(
+                    f"data set in {dataset_path(dataset_id)}",
+                    expected="the id of its folder",
+                    actual=repr(metadata["dataset_id"]),
+                )
+            found[dataset_id] = metadata
+        except (FileFormatError, OSError) as error:
+            warnings.warn(f"Not listed: {dataset_id!r}. {error}", stacklevel=3)
+    return found
+
+
+def _stored_ids(folder: Path, prefix: str, above: set[str]) -> Iterator[str]:
+    """Ids of the folders that hold ``data``; links are followed, but not back to where they come from."""
+    try:
+        place = os.path.realpath(folder)
+        names = sorted(entry.name for entry in os.scandir(folder) if entry.is_dir() and entry.name[0] != ".")
+    except OSError:
+        return
+    if place in above:
+        return
+    for name in names:
+        dataset_id = f"{prefix}{name}"
+        if is_valid_id(dataset_id):
+            if (folder / name / "data").exists():
+                yield dataset_id
+        else:
+            yield from _stored_ids(folder / name, f"{dataset_id}/", above | {place})
 
 
 def shipped_datasets() -> dict[str, str]:
@@ -122,16 +159,8 @@ def is_local(dataset_id: str) -> bool:
     return (dataset_path(dataset_id) / "data").exists()
 
 
-def is_valid_id(dataset_id: object) -> bool:
-    """Whether Minari can parse the id; such an id also stays inside the store as a path."""
-    from minari.dataset.minari_dataset import DATASET_ID_RE
-
-    match = DATASET_ID_RE.fullmatch(dataset_id) if isinstance(dataset_id, str) else None
-    return match is not None and match.group("version") is not None and "//" not in match.group()
-
-
-def check_dataset_id(dataset_id: str) -> None:
-    """Refuses an id that Minari could not parse.
+def check_dataset_id(dataset_id: object) -> None:
+    """Refuses an id that Minari could not parse, or would take for something else.
 
     Raises:
         InvalidArgumentError: Naming Minari's grammar.
@@ -159,10 +188,9 @@ def check_new_dataset(dataset_id: str, *, overwrite: bool) -> None:
 def recording_of(dataset_id: str) -> str | None:
     """The name of the recording that a local data set was sealed from; None where it has none or does not exist."""
     try:
-        metadata = json.loads((dataset_path(dataset_id) / "data" / "metadata.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        name = read_metadata(dataset_path(dataset_id)).get(RECORDING)
+    except (OSError, FileFormatError):
         return None
-    name = metadata.get(RECORDING) if isinstance(metadata, dict) else None
     return name if isinstance(name, str) else None
 
 
@@ -206,7 +234,6 @@ def write_dataset(
         InvalidArgumentError: For a malformed id, one that exists, or no episode at all.
         StorageError: Where the disk is full or fails; nothing is left behind.
     """
-    import minari
     from minari.dataset.minari_storage import MinariStorage
 
     check_new_dataset(dataset_id, overwrite=overwrite)
@@ -223,8 +250,9 @@ def write_dataset(
         building.mkdir(exist_ok=True)
         data = building / "data"
         if extend:
+            open_dataset(target)  # what is damaged must not be sealed anew
             shutil.copytree(target / "data", data)
-            storage = MinariStorage.read(data)
+            storage = open_dataset(building, sums=False).storage
         else:
             storage = MinariStorage.new(
                 data, observation_space=observation_space, action_space=action_space, env_spec=env_spec
@@ -247,7 +275,7 @@ def write_dataset(
     finally:
         if building is not None:
             shutil.rmtree(building, ignore_errors=True)
-    return minari.load_dataset(dataset_id)
+    return open_dataset(target, sums=False)
 
 
 def _finish(building: Path, metadata: dict[str, str]) -> None:
@@ -260,31 +288,6 @@ def _finish(building: Path, metadata: dict[str, str]) -> None:
     os.replace(new, path)
     write_manifest(building)
     building.chmod(0o755)
-
-
-def _load_local(dataset_id: str) -> MinariDataset:
-    import minari
-
-    try:
-        return minari.load_dataset(dataset_id)
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        AssertionError,
-        OSError,
-        ImportError,
-        gym.error.Error,
-    ) as error:
-        # An interrupted writer of another tool leaves such folders: an empty metadata.json, no HDF5 file.
-        raise FileFormatError(
-            f"data set {dataset_id!r} in {dataset_path(dataset_id)}",
-            expected="a complete Minari data set",
-            actual=f"{type(error).__name__}: {error}",
-            hint=f"Try `mpcoffline datasets repair {dataset_id}`, or remove that folder; a shipped data set comes"
-            " back when it is loaded again.",
-        ) from error
 
 
 def _materialise(dataset_id: str, file: str) -> MinariDataset:
@@ -308,7 +311,7 @@ def _materialise(dataset_id: str, file: str) -> MinariDataset:
             # Another process was faster: its copy is as good as ours.
             if not is_local(dataset_id):
                 raise
-            return _load_local(dataset_id)
+            return open_dataset(dataset_path(dataset_id))
 
 
 def _declare_namespace(dataset_id: str) -> None:

@@ -24,6 +24,7 @@ from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageErro
 from .atomic import sync_folder
 from .episode_log import EpisodeLog, LoggedEpisode, LogHeader, LogIndex, scan
 from .minari_store import check_new_dataset, dataset_path, is_local, recording_of, write_dataset
+from .opening import open_dataset
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -238,7 +239,6 @@ def seal(dataset_id: str) -> MinariDataset:
 
 
 def _seal(dataset_id: str) -> MinariDataset:
-    import minari
     from minari.serialization import deserialize_space
 
     indices = [scan(path) for path in log_files(dataset_id)]
@@ -266,8 +266,9 @@ def _seal(dataset_id: str) -> MinariDataset:
             recording=header.recording,
             building=building,
         )
+    dataset = open_dataset(dataset_path(dataset_id))  # first: the logs are all there is if it is damaged
     _remove_logs(dataset_id)
-    return minari.load_dataset(dataset_id)
+    return dataset
 
 
 def _in_order(indices: list[LogIndex]) -> Iterator[LoggedEpisode]:
