@@ -63,15 +63,29 @@ def show(
         console.print(summary)
 
 
-@app.command(epilog=examples("mpcoffline datasets verify mpcoffline/pendulum/ddpg-v0"))
-def verify(dataset_id: Id) -> None:
+@app.command(
+    epilog=examples(
+        "mpcoffline datasets verify mpcoffline/pendulum/ddpg-v0",
+        "mpcoffline datasets verify mine/plant/log-v0 --accept",
+    )
+)
+def verify(
+    dataset_id: Id,
+    accept: Annotated[
+        bool,
+        typer.Option(
+            "--accept",
+            help="Take files that were changed on purpose for good, where nothing else is wrong: new hashes.",
+        ),
+    ] = False,
+) -> None:
     """Check a data set: structure, hashes, NaN, bounds, alignment, reward = -cost.
 
     Exit code 1 if something is wrong.
     """
     from mpcoffline.datasets import verify as check
 
-    report = check(dataset_id)
+    report = check(dataset_id, accept=accept)
     console.print(report)
     raise typer.Exit(0 if report.ok else FOUND_WRONG)
 

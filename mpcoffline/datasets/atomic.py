@@ -34,16 +34,37 @@ def sync_tree(folder: Path) -> None:
 def publish(building: Path, target: Path, *, overwrite: bool) -> None:
     """Gives a finished folder its final name; what had that name is removed, after the fact.
 
+    Where the target lies on another disk (it, or a folder above it, is a link), the folder is copied beside it first,
+    so that it still appears in one step. A target that is a link stays one: what it leads to is replaced.
+
     Args:
-        building: The finished folder, in the same file system.
+        building: The finished folder.
         target: Its final name.
         overwrite: Whether an existing folder is replaced, in one step where the system can (Linux).
 
     Raises:
         OSError: Where the target exists and must not be replaced, or the file system refuses.
     """
+    if target.is_symlink():
+        target = Path(os.path.realpath(target))
     target.parent.mkdir(parents=True, exist_ok=True)
     sync_tree(building)
+    try:
+        _rename(building, target, overwrite)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        beside = target.parent / f".building-{building.name.removeprefix('.building-')}-{os.getpid()}"
+        try:
+            shutil.copytree(building, beside)
+            sync_tree(beside)
+            _rename(beside, target, overwrite)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(building)
+
+
+def _rename(building: Path, target: Path, overwrite: bool) -> None:
     if overwrite and target.exists():
         if not _exchange(building, target):
             # The gap between these two renames is closed by sealing again: the logs are still there.

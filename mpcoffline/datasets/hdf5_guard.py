@@ -31,6 +31,8 @@ _ONE_LEAF = (b"TREE\0\0\1\0", b"TREE\1\0\1\0")  # a tree of one entry, of a grou
 
 _CONTINUATIONS = 256
 
+_FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, OverflowError, struct.error)
+
 _Messages = dict[int, int]
 
 
@@ -46,6 +48,27 @@ def check_hdf5(path: Path) -> dict[str, int]:
     Raises:
         FileFormatError: Naming the file and the place in it.
     """
+    found = {}
+    for name, (rows, fault) in _looked_over(path).items():
+        if fault is not None:
+            raise fault
+        found[name] = rows
+    return found
+
+
+def check_episodes(path: Path) -> dict[str, str]:
+    """Like :func:`check_hdf5`, member by member.
+
+    Returns:
+        For each member of its root, why it must not be read; empty where nothing speaks against it.
+
+    Raises:
+        FileFormatError: Where the root itself cannot be read.
+    """
+    return {name: "" if fault is None else str(fault).rstrip(".") for name, (_, fault) in _looked_over(path).items()}
+
+
+def _looked_over(path: Path) -> dict[str, tuple[int, FileFormatError | None]]:
     check_regular(path)
     try:
         with (
@@ -53,13 +76,15 @@ def check_hdf5(path: Path) -> dict[str, int]:
             path.open("rb") as raw,
             mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as content,
         ):
-            return _Walk(f"file {path}", content, file).rows()
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, OverflowError, struct.error) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(
-            f"file {path}", expected="an intact HDF5 file", actual=f"{type(error).__name__}: {error}"
-        ) from error
+            return _Walk(f"file {path}", content, file).members()
+    except _FAULTS as error:
+        raise _fault(f"file {path}", error) from error
+
+
+def _fault(name: str, error: Exception) -> FileFormatError:
+    if isinstance(error, FileFormatError):
+        return error
+    return FileFormatError(name, expected="an intact HDF5 file", actual=f"{type(error).__name__}: {error}")
 
 
 class _Walk:
@@ -74,12 +99,16 @@ class _Walk:
         self._bytes_left = EXPANSION_ALLOWANCE + EXPANSION * len(content)
         self._members_left = len(content) // LINK_BYTES
 
-    def rows(self) -> dict[str, int]:
+    def members(self) -> dict[str, tuple[int, FileFormatError | None]]:
+        """For each member of the root its rows, as :meth:`_visit` counts them, and what is wrong with it."""
         place = self._root()
-        return {
-            name: self._visit(f"/{name}", target, GROUP_DEPTH)
-            for name, target in self._members("/", place, self._messages("/", place))
-        }
+        found: dict[str, tuple[int, FileFormatError | None]] = {}
+        for name, target in self._members("/", place, self._messages("/", place)):
+            try:
+                found[name] = (self._visit(f"/{name}", target, GROUP_DEPTH), None)
+            except _FAULTS as error:
+                found[name] = (-1, _fault(f"{self._name}: /{name}", error))
+        return found
 
     def _root(self) -> int:
         """Where the root group is, in a file that begins with its superblock and counts from there."""
@@ -93,6 +122,8 @@ class _Walk:
 
     def _visit(self, where: str, place: int, depth: int) -> int:
         """The rows of an array, or of a group's array ``rewards``; -1 where there are none."""
+        if place == _UNDEFINED:
+            raise self._refused(where, "data in this file", "a link")
         if place in self._arrays:
             return self._declare(where, place)
         column = where[where.rfind("/") :]
@@ -123,7 +154,7 @@ class _Walk:
     # Groups
 
     def _members(self, where: str, place: int, messages: _Messages) -> list[tuple[str, int]]:
-        """Names and places of a group's members, all of which are objects of this file."""
+        """Names and places of a group's members; the place of a link to elsewhere is undefined."""
         self._once(where, place)
         if _SYMBOL_TABLE in messages:
             tree, heap = _PAIR.unpack_from(self._content, messages[_SYMBOL_TABLE])
@@ -131,18 +162,13 @@ class _Walk:
             leaves = self._leaves(where, tree, kind=0, width=16)
             return [member for leaf in leaves for member in self._symbols(where, self._word(leaf + 8), names)]
         found: list[tuple[str, int]] = []
-        odd: list[str] = []
 
         def collect(name: bytes, info: Any) -> bool | None:
-            if info.type != h5py.h5l.TYPE_HARD:
-                odd.append(name.decode(errors="replace"))
-                return True
-            found.append((self._text(where, name), int(info.u)))
+            found.append((self._text(where, name), int(info.u) if info.type == h5py.h5l.TYPE_HARD else _UNDEFINED))
             return True if len(found) > self._members_left else None
 
-        h5py.h5g.open(self._file.id, where.encode()).links.iterate(collect, info=True)
-        if odd:
-            raise self._refused(f"{where.rstrip('/')}/{odd[0]}", "data in this file", "a link")
+        group = h5py.h5g.open(self._file.id, where.encode())  # its links do not keep it open
+        group.links.iterate(collect, info=True)
         self._spend(where, len(found))
         return found
 
@@ -157,9 +183,7 @@ class _Walk:
             offset, target = _PAIR.unpack_from(content, entry)
             start = names + offset
             name = self._text(where, content[start : max(start, content.find(b"\0", start, start + _NAME_BYTES))])
-            if content[entry + 16] == 2 or target == _UNDEFINED:
-                raise self._refused(f"{where}/{name}", "data in this file", "a link")
-            found.append((name, target))
+            found.append((name, _UNDEFINED if content[entry + 16] == 2 else target))
         return found
 
     def _leaves(self, where: str, tree: int, kind: int, width: int) -> list[int]:

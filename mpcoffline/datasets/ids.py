@@ -27,7 +27,7 @@ def is_valid_id(dataset_id: object) -> bool:
     if not isinstance(dataset_id, str) or len(dataset_id) > ID_LENGTH or "//" in dataset_id:
         return False
     match = DATASET_ID_RE.fullmatch(dataset_id)
-    if match is None or _NUMBER.fullmatch(dataset_id) is None:
+    if match is None or match.group("version") is None or _NUMBER.fullmatch(dataset_id) is None:
         return False
     *namespaces, _ = parts = dataset_id.split("/")
     try:

@@ -264,7 +264,7 @@ def write_dataset(
                 "description": description,
             }
         storage.update_episodes(itertools.chain([first], iterator))
-        _finish(building, {key: value for key, value in metadata.items() if value is not None})
+        finish(building, {key: value for key, value in metadata.items() if value is not None})
         _declare_namespace(dataset_id)
         publish(building, target, overwrite=overwrite)
     except (OSError, RuntimeError) as error:
@@ -278,7 +278,7 @@ def write_dataset(
     return open_dataset(target, sums=False)
 
 
-def _finish(building: Path, metadata: dict[str, str]) -> None:
+def finish(building: Path, metadata: dict[str, str]) -> None:
     """Completes a data set's folder: data on the disk, then its metadata, then the manifest of both."""
     sync_tree(building)
     path = building / "data" / "metadata.json"

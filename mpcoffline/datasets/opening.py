@@ -13,9 +13,9 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from mpcoffline.core.limits import (
 from mpcoffline.core.places import cache_folder
 from mpcoffline.errors import FileFormatError
 
-from .hdf5_guard import check_hdf5
+from .hdf5_guard import check_episodes, check_hdf5
 from .ids import is_valid_id
 from .manifest import MANIFEST, differences
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 DATA_FILE = "main_data.hdf5"
 _SETTLED = 100_000_000  # ns; a file changed later than that could change again without another time
 _RECORD_VERSION = 1
+_T = TypeVar("_T")
 
 
 def open_dataset(folder: Path, *, sums: bool = True) -> MinariDataset:
@@ -57,20 +58,38 @@ def open_dataset(folder: Path, *, sums: bool = True) -> MinariDataset:
     """
     from minari import MinariDataset
 
-    try:
-        if sums:
-            check_stored(folder)
-        else:
-            check_data(folder)
-        return MinariDataset(folder / "data")
-    except FileFormatError as error:
-        if error.hint:
-            raise
-        raise FileFormatError(
-            error.name, expected=error.expected, actual=error.actual, hint=_repair_hint(folder)
-        ) from error
-    except Exception as error:  # assertions, lookups, versions: whatever a damaged file makes Minari do
-        raise _incomplete(folder, error) from error
+    if sums:
+        check_stored(folder)
+    else:
+        _or_incomplete(folder, check_data)
+    return _or_incomplete(folder, lambda folder: MinariDataset(folder / "data"))
+
+
+def open_to_examine(folder: Path) -> tuple[MinariDataset, dict[str, str]]:
+    """Opens a data set of which some episodes may be damaged.
+
+    Returns:
+        The data set, and for each group that must not be read why.
+
+    Raises:
+        FileFormatError: Where it is damaged as a whole.
+    """
+    from minari import MinariDataset
+
+    faults = _or_incomplete(folder, faults_of)
+    return _or_incomplete(folder, lambda folder: MinariDataset(folder / "data")), faults
+
+
+def faults_of(folder: Path) -> dict[str, str]:
+    """For each group of an HDF5 data set that must not be read why.
+
+    Raises:
+        FileFormatError: Where it is damaged as a whole.
+    """
+    if read_metadata(folder)["data_format"] != "hdf5":
+        check_data(folder)
+        return {}
+    return {name: fault for name, fault in check_episodes(folder / "data" / DATA_FILE).items() if fault}
 
 
 def check_stored(folder: Path) -> None:
@@ -79,23 +98,23 @@ def check_stored(folder: Path) -> None:
     Raises:
         FileFormatError: Naming what is wrong and what to do next.
     """
-    try:
-        state = _state(folder)
-        if _is_known(folder, state):
-            return
-        check_sums(folder)
-        episodes, steps = check_data(folder)
-        metadata = read_metadata(folder)
-    except (OSError, RecursionError) as error:
-        raise _incomplete(folder, error) from error
+    _or_incomplete(folder, _check_stored)
+
+
+def _check_stored(folder: Path) -> None:
+    state = _state(folder)
+    if _is_known(folder, state):
+        return
+    episodes, steps = check_data(folder)
+    metadata = read_metadata(folder)
     counts = (metadata["total_episodes"], metadata["total_steps"])
     if steps >= 0 and counts != (episodes, steps):
         raise FileFormatError(
-            f"data set in {folder}",
+            "counts",
             expected=f"{counts[0]} episodes of {counts[1]} steps, as its metadata say",
             actual=f"{episodes} of {steps}",
-            hint=f"Try `mpcoffline datasets repair {_id_of(folder)}`.",
         )
+    check_sums(folder)
     if state == _state(folder):
         _remember(folder, state)
 
@@ -175,8 +194,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             raise FileFormatError(
                 str(path),
                 expected=f"a stored {key}",
-                actual="none",
-                hint="Without it Minari would import and make the environment that the file names.",
+                actual="none: Minari would import and make the environment that the file names",
             )
         check_space(f"{path}: {key}", metadata[key])
     for key in ("total_episodes", "total_steps"):
@@ -301,17 +319,18 @@ def _id_of(folder: Path) -> str:
         return str(folder)
 
 
-def _incomplete(folder: Path, error: Exception) -> FileFormatError:
-    return FileFormatError(
-        f"data set in {folder}",
-        expected="a complete Minari data set",
-        actual=f"{type(error).__name__}: {error}",
-        hint=_repair_hint(folder),
-    )
-
-
-def _repair_hint(folder: Path) -> str:
-    return (
-        f"Try `mpcoffline datasets repair {_id_of(folder)}`, or remove that folder; a shipped data set comes back"
-        " when it is loaded again."
-    )
+def _or_incomplete(folder: Path, read: Callable[[Path], _T]) -> _T:
+    """What a reader gives; whatever it raises says which data set it is, and what to do next."""
+    try:
+        return read(folder)
+    except Exception as error:  # assertions, lookups, versions: whatever a damaged file makes Minari do
+        if isinstance(error, FileFormatError) and error.hint:
+            raise
+        said = str(error).rstrip(".") if isinstance(error, FileFormatError) else f"{type(error).__name__}: {error}"
+        raise FileFormatError(
+            f"data set in {folder}",
+            expected="a complete Minari data set",
+            actual=said,
+            hint=f"Try `mpcoffline datasets repair {_id_of(folder)}`, or remove that folder; a shipped data set comes"
+            " back when it is loaded again.",
+        ) from error

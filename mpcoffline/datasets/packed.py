@@ -10,6 +10,7 @@ machine's sine into a visibly different episode.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.envs import ControlTask
 from mpcoffline.errors import FileFormatError, InvalidDataError
 
+from .hdf5_guard import check_hdf5
 from .minari_store import write_dataset
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
 FORMAT = "mpcoffline packed episodes"
 VERSION = 1
+_DAMAGES = (KeyError, OSError, TypeError, ValueError, AttributeError)
 
 
 def pack(dataset: MinariDataset, path: str | Path) -> None:
@@ -79,7 +82,10 @@ def packed_size(path: str | Path) -> tuple[int, int]:
         FileFormatError: For a file that is not one.
     """
     with _open(path) as file:
-        lengths = file["lengths"][:]
+        try:
+            lengths = _lengths(file, path)
+        except _DAMAGES as error:
+            raise _damaged(path, f"{type(error).__name__}: {error}") from error
     return len(lengths), int(lengths.sum())
 
 
@@ -99,18 +105,23 @@ def unpack(path: str | Path, dataset_id: str, *, overwrite: bool = False) -> Min
         try:
             spec = EnvSpec.from_json(str(file.attrs["env_spec"]))
             states, actions = file["states"][:], file["actions"][:]
-            lengths, terminated = file["lengths"][:], file["terminated"][:]
+            lengths, terminated = _lengths(file, path), file["terminated"][:]
             texts = {key: str(file.attrs[key]) or None for key in ("algorithm_name", "description")}
-        except (KeyError, OSError) as error:
-            raise _damaged(path, str(error)) from error
+        except _DAMAGES as error:
+            raise _damaged(path, f"{type(error).__name__}: {error}") from error
+    if any(array.dtype.kind not in "fiub" for array in (states, actions, terminated)):
+        raise _damaged(path, "columns that are no numbers")
     if len(actions) != lengths.sum() or len(states) != len(actions) + len(lengths):
         raise _damaged(path, f"{len(states)} states, {len(actions)} actions in {len(lengths)} episodes")
     task = _task(spec)
     first = np.concatenate([[0], np.cumsum(lengths)])
-    episodes = [
-        _episode(task, states[begin + i : end + i + 1], actions[begin:end], bool(terminated[i]))
-        for i, (begin, end) in enumerate(itertools.pairwise(first))
-    ]
+    try:
+        episodes = [
+            _episode(task, states[begin + i : end + i + 1], actions[begin:end], bool(terminated[i]))
+            for i, (begin, end) in enumerate(itertools.pairwise(first))
+        ]
+    except (ValueError, IndexError) as error:
+        raise _damaged(path, f"states or actions of another task: {error}") from error
     return write_dataset(
         dataset_id,
         episodes,
@@ -171,7 +182,15 @@ def _check_recomputes(where: str, task: ControlTask, states: NDArray[np.float64]
 
 
 def _task(spec: EnvSpec) -> ControlTask:
-    task = gym.make(spec).unwrapped
+    """The registered environment of that id with the spec's arguments: nothing that a file names is imported."""
+    known = gym.registry.get(spec.id)
+    if known is None or known.entry_point != spec.entry_point or spec.additional_wrappers:
+        raise InvalidDataError(
+            f"environment {spec.id!r}",
+            expected="one of this package's tasks, without wrappers",
+            actual=f"{spec.entry_point}",
+        )
+    task = gym.make(replace(known, kwargs=dict(spec.kwargs), max_episode_steps=spec.max_episode_steps)).unwrapped
     if not isinstance(task, ControlTask):
         raise InvalidDataError(
             f"environment {spec.id!r}", expected="one of this package's tasks", actual=type(task).__name__
@@ -179,8 +198,16 @@ def _task(spec: EnvSpec) -> ControlTask:
     return task
 
 
+def _lengths(file: Any, path: str | Path) -> NDArray[np.int64]:
+    lengths = file["lengths"][:]
+    if lengths.ndim != 1 or lengths.dtype.kind not in "iu" or (lengths < 1).any():
+        raise _damaged(path, "lengths of episodes that are no positive integers")
+    return np.asarray(lengths, dtype=np.int64)
+
+
 def _open(path: str | Path) -> Any:
     try:
+        check_hdf5(Path(path))
         file = h5py.File(path, "r")
     except OSError as error:
         raise _damaged(path, str(error)) from error

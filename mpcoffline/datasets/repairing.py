@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import errno
+import importlib.metadata
 import json
 import os
 import shutil
-from collections.abc import Iterator
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from mpcoffline.errors import FileFormatError, UnknownIdError
+from mpcoffline.core.files import check_regular, read_limited
+from mpcoffline.core.limits import METADATA_BYTES
+from mpcoffline.errors import FileFormatError, StorageError, UnknownIdError
 
-from .minari_store import check_dataset_id, dataset_path, is_local, list_datasets, recording_of, write_dataset
+from .atomic import publish
+from .hdf5_guard import check_episodes
+from .manifest import MANIFEST, differences
+from .minari_store import check_dataset_id, dataset_path, finish, is_local, list_datasets, recording_of
+from .opening import DATA_FILE, check_space, open_dataset
 from .recording import RecordingLock, log_files, recording_path, seal
-
-if TYPE_CHECKING:
-    from minari import MinariDataset
-    from minari.data_collector import EpisodeBuffer
 
 _STEPS = ("actions", "rewards", "terminations", "truncations")
 
@@ -58,7 +62,11 @@ def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:
     """Makes a data set readable again: from the logs of its recording, or from what its HDF5 file still holds.
 
     Repairs what a killed recorder leaves (logs that are not sealed), and what a killed Minari leaves (an empty
-    ``metadata.json``, a half-written episode, counts that do not fit). What is found is kept as a backup.
+    ``metadata.json``, a half-written episode, counts that do not fit). Episodes are copied as they are, with all that
+    stands beside them, and so are all entries of the metadata that can be read. What is found is kept as a backup.
+
+    Numbers that have changed cannot be told from those that have not: a data set that is readable but not what its
+    manifest says is refused, and one that must be rebuilt although its data are not, says so in a note.
 
     Args:
         dataset_id: Minari id.
@@ -67,7 +75,8 @@ def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:
     Raises:
         InvalidArgumentError: For a malformed id, or a recorder at work on it.
         UnknownIdError: Where there is neither such a data set nor a recording of it.
-        FileFormatError: Where nothing can be read; nothing is changed then.
+        FileFormatError: Where nothing can be read, or the files are readable but not those of the manifest; nothing is
+            changed then.
         StorageError: Where the disk refuses; nothing is changed then.
     """
     check_dataset_id(dataset_id)
@@ -95,40 +104,67 @@ def _repair_stored(dataset_id: str, env_spec: EnvSpec | None) -> RepairReport:
         raise FileFormatError(
             f"data set {dataset_id!r}", expected="format 'hdf5'", actual=repr(metadata.get("data_format"))
         )
-    file = _open(path)
-    with file:
-        try:
-            good, notes = _inspect(file)
-        except (OSError, RuntimeError, KeyError) as error:
-            raise _unreadable(path, error) from error
+    with _open(path) as file:
+        good, notes = _inspect(file, path)
         steps = sum(len(file[f"{name}/rewards"]) for name in good)
         counts = (metadata.get("total_episodes"), metadata.get("total_steps"))
-        if not notes and counts == (len(good), steps) and _is_readable(dataset_id):
+        if not notes and counts == (len(good), steps) and _is_intact(dataset_id):
             return RepairReport(dataset_id, "intact", len(good), steps)
         if not good:
             raise FileFormatError(f"file {path}", expected="a readable episode", actual="none")
+        _note_changes(dataset_id, notes)
         observed, acted = (_space(metadata, kind, file[good[0]], notes) for kind in ("observation", "action"))
-        if env_spec is None:
-            env_spec = _env_spec(metadata, notes)
-        backup = _back_up(dataset_id)
-        dataset: MinariDataset = write_dataset(
-            dataset_id,
-            _episodes(file, good),
-            env_spec=env_spec,
-            observation_space=observed,
-            action_space=acted,
-            algorithm_name=metadata.get("algorithm_name"),
-            description=metadata.get("description"),
-            overwrite=True,
-        )
+        spec = _env_spec(metadata, notes) if env_spec is None else env_spec.to_json()
+        kept = metadata | {
+            "dataset_id": dataset_id,
+            "minari_version": importlib.metadata.version("minari"),
+            "data_format": "hdf5",
+            "jpeg_encoding": bool(metadata.get("jpeg_encoding", True)),
+            "observation_space": observed,
+            "action_space": acted,
+            "total_episodes": len(good),
+            "total_steps": steps,
+        }
+        kept = {key: value for key, value in kept.items() if key != "env_spec"}
+        backup = _rebuild(dataset_id, file, good, kept if spec is None else kept | {"env_spec": spec})
+    dataset = open_dataset(dataset_path(dataset_id), sums=False)
     return RepairReport(
         dataset_id, "rebuilt", int(dataset.total_episodes), int(dataset.total_steps), tuple(notes), backup
     )
 
 
+def _rebuild(dataset_id: str, file: Any, names: list[str], metadata: dict[str, Any]) -> Path:
+    """Puts a data set of these groups of a file in the place of the damaged one; returns where that is kept."""
+    target, building = dataset_path(dataset_id), None
+    try:
+        free, needed = shutil.disk_usage(dataset_path("")).free, int(Path(file.filename).stat().st_size) + (1 << 20)
+        if free < needed:  # HDF5 itself must not meet a full disk: it would end the process
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        building = Path(tempfile.mkdtemp(prefix=".building-", dir=dataset_path("")))
+        data = building / "data"
+        data.mkdir()
+        with h5py.File(data / DATA_FILE, "w", track_order=True) as new:
+            for number, name in enumerate(names):
+                file.copy(name, new, f"episode_{number}")
+                new[f"episode_{number}"].attrs["id"] = number
+        (data / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
+        finish(building, {})
+        backup = _back_up(dataset_id)
+        publish(building, target, overwrite=True)
+    except (OSError, RuntimeError, shutil.Error) as error:
+        raise StorageError.of(target, error) from error
+    finally:
+        if building is not None:
+            shutil.rmtree(building, ignore_errors=True)
+    return backup
+
+
 def _open(path: Path) -> Any:
     try:
+        check_regular(path)
         return h5py.File(path, "r")
+    except FileFormatError:
+        raise
     except OSError as error:
         raise _unreadable(path, error) from error
 
@@ -144,27 +180,25 @@ def _unreadable(path: Path, error: Exception) -> FileFormatError:
 
 def _metadata(dataset_id: str) -> dict[str, Any]:
     try:
-        found = json.loads((dataset_path(dataset_id) / "data" / "metadata.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(read_limited(dataset_path(dataset_id) / "data" / "metadata.json", METADATA_BYTES))
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 
 
-def _inspect(file: Any) -> tuple[list[str], list[str]]:
+def _inspect(file: Any, path: Path) -> tuple[list[str], list[str]]:
     """Names of the groups that hold a whole episode, in order, and a sentence for each other one."""
     good, notes = [], []
-    numbered = {int(name[8:]): name for name in file if name.startswith("episode_") and name[8:].isdecimal()}
+    try:
+        checked = check_episodes(path)
+    except (OSError, RuntimeError) as error:
+        raise _unreadable(path, error) from error
+    numbered = {int(name[8:]): name for name in checked if name.startswith("episode_") and name[8:].isdecimal()}
     for _, name in sorted(numbered.items()):
+        reason = checked[name]
         try:
-            lengths = {key: len(file[name][key]) for key in ("observations", *_STEPS)}
-            infos = {key: len(value) for key, value in file[name].get("infos", {}).items()}
-            steps = lengths["rewards"]
-            wrong = [key for key in _STEPS if lengths[key] != steps]
-            wrong += [key for key, n in {"observations": lengths["observations"], **infos}.items() if n != steps + 1]
-            reason = f"unequal lengths of {', '.join(wrong)}" if wrong else "" if steps else "no step"
-            for key in () if reason else lengths:
-                file[name][key][()]
-        except (KeyError, OSError, TypeError, ValueError, RuntimeError) as error:
+            reason = reason or _fault(file[name])
+        except (KeyError, OSError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             reason = f"{type(error).__name__}: {error}"
         if reason:
             notes.append(f"{name} is left out: {reason}.")
@@ -173,58 +207,114 @@ def _inspect(file: Any) -> tuple[list[str], list[str]]:
     return good, notes
 
 
-def _episodes(file: Any, names: list[str]) -> Iterator[EpisodeBuffer]:
-    from minari.data_collector import EpisodeBuffer
+def _fault(group: Any) -> str:
+    """What keeps a group from being a whole episode; empty if nothing. Its arrays are read to the end."""
+    steps = len(group["rewards"])
+    lengths = dict(_lengths(group["observations"], "observations"))
+    for key in _STEPS:
+        lengths |= _lengths(group[key], key)
+    infos = _lengths(group["infos"], "infos") if "infos" in group else {}
+    wrong = [key for key, n in lengths.items() if n != steps + key.startswith("observations")]
+    wrong += [key for key, n in infos.items() if n != steps + 1]
+    return f"unequal lengths of {', '.join(wrong)}" if wrong else "" if steps else "no step"
 
-    for name in names:
-        group = file[name]
-        infos = {key: value[()] for key, value in group.get("infos", {}).items()}
-        seed = group.attrs.get("seed")
-        columns: dict[str, Any] = {key: group[key][()] for key in ("observations", *_STEPS)}
-        yield EpisodeBuffer(**columns, infos=infos, seed=None if seed is None else int(seed))
+
+def _lengths(member: Any, name: str) -> dict[str, int]:
+    """Rows of an array, or of all arrays of a group (spaces and infos within others), each of which is read."""
+    if isinstance(member, h5py.Dataset):
+        member[()]
+        return {name: len(member)}
+    return {key: n for inner in member for key, n in _lengths(member[inner], f"{name}/{inner}").items()}
 
 
-def _space(metadata: dict[str, Any], kind: str, group: Any, notes: list[str]) -> spaces.Space[Any]:
-    from minari.serialization import deserialize_space
+def _note_changes(dataset_id: str, notes: list[str]) -> None:
+    """Says so where the data that are kept are not those of the manifest."""
+    try:
+        changed = [difference.path for difference in differences(dataset_path(dataset_id))]
+    except FileNotFoundError:
+        return
+    except FileFormatError as error:
+        notes.append(f"Whether numbers have changed is unknown: {error}")
+        return
+    if f"data/{DATA_FILE}" in changed:
+        notes.append(
+            f"{DATA_FILE} is not what {MANIFEST} says: numbers in the episodes that are kept may be wrong."
+            f" The new {MANIFEST} is of the files as they are now."
+        )
 
+
+def _space(metadata: dict[str, Any], kind: str, group: Any, notes: list[str]) -> str:
+    """The stored space as Minari writes it; where it is lost, one that fits the data."""
     stored = metadata.get(f"{kind}_space")
     if isinstance(stored, str):
+        from minari.serialization import deserialize_space
+
         try:
-            space: spaces.Space[Any] = deserialize_space(stored)
-            return space
-        except (ValueError, KeyError, TypeError, AssertionError):
+            check_space(kind, stored)
+            deserialize_space(stored)
+            return stored
+        except (ValueError, KeyError, TypeError, AssertionError, NotImplementedError):
             pass
+    from minari.serialization import serialize_space
+
     values = group[f"{kind}s"]
     notes.append(f"The {kind} space is lost; an unbounded Box of shape {values.shape[1:]} takes its place.")
-    return spaces.Box(-np.inf, np.inf, values.shape[1:], values.dtype)
+    return str(serialize_space(spaces.Box(-np.inf, np.inf, values.shape[1:], values.dtype)))
 
 
-def _env_spec(metadata: dict[str, Any], notes: list[str]) -> EnvSpec | None:
+def _env_spec(metadata: dict[str, Any], notes: list[str]) -> str | None:
     stored = metadata.get("env_spec")
     if stored is None and metadata:
         return None
     try:
-        return EnvSpec.from_json(str(stored))
+        EnvSpec.from_json(str(stored))
+        return str(stored)
     except (ValueError, TypeError, KeyError, AttributeError):
         notes.append("The environment's spec is lost; repair(..., env_spec=...) can give it.")
         return None
 
 
-def _is_readable(dataset_id: str) -> bool:
-    import minari
+def _is_intact(dataset_id: str) -> bool:
+    """Whether it can be opened.
 
+    Raises:
+        FileFormatError: Where it could be, but is not what its manifest says.
+    """
+    folder = dataset_path(dataset_id)
     try:
-        minari.load_dataset(dataset_id)
-    except Exception:
+        open_dataset(folder, sums=False)
+    except FileFormatError:
+        return False
+    open_dataset(folder)
+    return True
+
+
+def _is_readable(dataset_id: str) -> bool:
+    try:
+        open_dataset(dataset_path(dataset_id))
+    except FileFormatError:
         return False
     return True
 
 
 def _back_up(dataset_id: str) -> Path:
-    """Keeps the folder as it is under another, hidden name: links, so that it needs no room until it is replaced."""
+    """Keeps the folder as it is under another, hidden name: links where they can be, so that it needs no room yet."""
     source, number = dataset_path(dataset_id), 0
     while (backup := dataset_path("") / ".broken" / f"{dataset_id}-{number}").exists():
         number += 1
     backup.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(source, backup, copy_function=os.link)
+    shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)
     return backup
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another disk, or a file system without links
+        shutil.copy2(source, target)
+
+
+def _special(folder: str, names: list[str]) -> list[str]:
+    """What is neither file nor folder cannot be kept."""
+    paths = {name: Path(folder) / name for name in names}
+    return [name for name, path in paths.items() if not (path.is_file() or path.is_dir())]

@@ -57,7 +57,7 @@ def block_batches(
     import torch
 
     capacity = max(1, memory // 2 // (file.block_rows * file.row_bytes))
-    pool = np.empty((capacity * file.block_rows + batch_size, file.rows.shape[1]), dtype=np.float32)
+    pool = np.empty((capacity * file.block_rows + batch_size, file.width), dtype=np.float32)
     tensor = torch.from_numpy(pool)
     for _ in itertools.count() if epochs is None else range(epochs):
         blocks = rng.permutation(file.n_blocks).tolist()

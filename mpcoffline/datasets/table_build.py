@@ -15,6 +15,7 @@ from mpcoffline.errors import FileFormatError, InvalidDataError, StorageError
 
 from .checks import check_finite
 from .hdf5_episodes import EpisodeColumns, read_episodes
+from .opening import DATA_FILE, check_stored
 from .table_cache import TableFile, cached_table, content_key, scratch_table
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path) -> 
         _size(name, kind, space)
         for kind, space in (("observation", dataset.observation_space), ("action", dataset.action_space))
     )
+    check_stored(Path(dataset.spec.data_path).parent)
     steps = int(dataset.total_steps)
     if steps == 0:
         raise InvalidDataError(name, expected="at least one episode", actual="none")
@@ -94,7 +96,7 @@ def _size(name: str, kind: str, space: Any) -> int:
 
 
 def _hdf5_file(dataset: MinariDataset) -> Path | None:
-    path = Path(dataset.spec.data_path) / "main_data.hdf5"
+    path = Path(dataset.spec.data_path) / DATA_FILE
     return path if path.is_file() else None
 
 

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.core.files import check_regular, read_limited
+from mpcoffline.core.limits import TABLE_META_BYTES
 from mpcoffline.errors import FileFormatError, StorageError
 
 from .atomic import publish
@@ -41,8 +43,8 @@ class TableFile:
     Attributes:
         ny: Number of observation coordinates.
         nu: Number of action coordinates.
-        rows: The rows ``(n, 2 ny + nu + 2)``, mapped.
-        episode_ids: The episode of each row ``(n,)``, mapped.
+        raw_rows: The rows ``(n, 2 ny + nu + 2)`` as they are in the file, mapped; :attr:`rows` are checked.
+        raw_ids: The episode of each ``(n,)``, likewise.
         block_rows: Number of rows in a block.
 
     Raises:
@@ -52,7 +54,9 @@ class TableFile:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
-            meta = json.loads((folder / _META).read_text(encoding="utf-8"))
+            meta = json.loads(read_limited(folder / _META, TABLE_META_BYTES))
+            for name in (_ROWS, _IDS):
+                check_regular(folder / name)
             if meta["version"] != VERSION:
                 raise ValueError(f"version {meta['version']}")
             self.ny, self.nu, n = int(meta["ny"]), int(meta["nu"]), int(meta["rows"])
@@ -65,11 +69,47 @@ class TableFile:
             sizes = (os.fstat(self._fd).st_size, (folder / _IDS).stat().st_size)
             if sizes != (n * self.row_bytes, 8 * n) or len(self._crcs) != -(-n // self.block_rows):
                 raise ValueError(f"files of {sizes} bytes for {n} rows")
-            self.rows: NDArray[np.float32] = np.memmap(folder / _ROWS, np.float32, "r", shape=shape)
-            self.episode_ids: NDArray[np.int64] = np.memmap(folder / _IDS, np.int64, "r", shape=(n,))
-        except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
+            self.raw_rows: NDArray[np.float32] = np.memmap(folder / _ROWS, np.float32, "r", shape=shape)
+            self.raw_ids: NDArray[np.int64] = np.memmap(folder / _IDS, np.int64, "r", shape=(n,))
+        except (OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
             raise self._damaged(f"{type(error).__name__}: {error}") from error
+        self._ids_checked = False
         self._checked = np.zeros(len(self._crcs), dtype=bool)
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.raw_rows)
+
+    @property
+    def width(self) -> int:
+        """Number of columns, 2 ny + nu + 2."""
+        return int(self.raw_rows.shape[1])
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """The rows ``(n, 2 ny + nu + 2)``, mapped; all of them are checked the first time.
+
+        Raises:
+            FileFormatError: Where they are not what was written.
+        """
+        if not self._checked.all():
+            block = np.empty((self.block_rows, self.width), np.float32)
+            for number in np.flatnonzero(~self._checked).tolist():
+                self.read_block(number, block)
+        return self.raw_rows
+
+    @property
+    def episode_ids(self) -> NDArray[np.int64]:
+        """The episode of each row ``(n,)``, mapped; checked the first time.
+
+        Raises:
+            FileFormatError: Where they are not what was written.
+        """
+        if not self._ids_checked:
+            if zlib.crc32(_bytes(self.raw_ids)) != self._ids_crc:
+                raise self._damaged("episode ids with another CRC-32")
+            self._ids_checked = True
+        return self.raw_ids
 
     @property
     def n_blocks(self) -> int:
@@ -82,7 +122,7 @@ class TableFile:
         Raises:
             FileFormatError: Where they are not what was written.
         """
-        rows, ids = np.empty(self.rows.shape, np.float32), np.array(self.episode_ids)
+        rows, ids = np.empty(self.raw_rows.shape, np.float32), np.array(self.raw_ids)
         for block in range(self.n_blocks):
             start = block * self.block_rows
             self.read_block(block, rows[start : start + self.block_rows])
@@ -96,7 +136,7 @@ class TableFile:
         Raises:
             FileFormatError: Where it is not what was written.
         """
-        count = min(self.block_rows, len(self.rows) - block * self.block_rows)
+        count = min(self.block_rows, len(self) - block * self.block_rows)
         view = _bytes(out[:count])
         offset, done = block * self.block_rows * self.row_bytes, 0
         while done < len(view):
@@ -220,7 +260,7 @@ def content_key(path: Path, episodes: NDArray[Any] | None, cache: Path) -> str:
     signature = [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
     note = cache / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:32]}.json"
     try:
-        known = json.loads(note.read_text(encoding="utf-8"))
+        known = json.loads(read_limited(note, 1000))
         digest = str(known["sha256"]) if known["signature"] == signature else None
     except (OSError, ValueError, KeyError, TypeError):
         digest = None

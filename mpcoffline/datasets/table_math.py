@@ -47,6 +47,13 @@ class TableStatistics(NamedTuple):
     high: Columns
 
 
+def episodes_by_continuity(rows: NDArray[np.float32], ny: int, nu: int) -> NDArray[np.int64]:
+    """Numbers of the episodes ``(n,)`` of packed rows: a row goes on where the one before ended, unless terminated."""
+    after = ny + nu + 1
+    goes_on = (rows[:-1, after : after + ny] == rows[1:, :ny]).all(axis=1) & (rows[:-1, after + ny] == 0.0)
+    return np.concatenate([[0], np.cumsum(~goes_on)]).astype(np.int64)
+
+
 def moments(rows: NDArray[np.float32]) -> tuple[Floats, Floats, Floats, Floats]:
     """Mean, standard deviation, smallest and largest value of each column, in one pass.
 

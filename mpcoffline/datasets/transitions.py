@@ -16,7 +16,7 @@ from .checks import check_finite, checked_episode_ids, floats, place
 from .sampler import block_batches, gather_batches
 from .table_build import read_minari
 from .table_cache import TableFile, default_cache, default_memory, scratch_table
-from .table_math import CHUNK, Columns, TableStatistics, innermost, moments
+from .table_math import CHUNK, Columns, TableStatistics, episodes_by_continuity, innermost, moments
 
 __all__ = ["Columns", "TableStatistics", "TransitionTable"]
 
@@ -56,8 +56,18 @@ class TransitionTable:
         file: TableFile | None = None,
         memory: int | None = None,
     ) -> None:
-        self.rows, self.ny, self.nu, self.episode_ids, self.name = rows, ny, nu, episode_ids, name
+        self._rows, self.ny, self.nu, self._episode_ids, self.name = rows, ny, nu, episode_ids, name
         self._file, self._memory = file, memory
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """The packed rows; those of a file are checked first, once (``FileFormatError`` where it is damaged)."""
+        return self._rows if self._file is None else self._file.rows
+
+    @property
+    def episode_ids(self) -> NDArray[np.int64]:
+        """Episode of each row; those of a file are checked first, once."""
+        return self._episode_ids if self._file is None else self._file.episode_ids
 
     @property
     def is_mapped(self) -> bool:
@@ -65,8 +75,7 @@ class TransitionTable:
         return self._file is not None
 
     def __len__(self) -> int:
-        """Number of transitions n."""
-        return len(self.rows)
+        return len(self._rows)
 
     def __repr__(self) -> str:
         return f"TransitionTable({self.name!r}, n={len(self)}, ny={self.ny}, nu={self.nu})"
@@ -167,9 +176,8 @@ class TransitionTable:
             raise InvalidDataError(
                 f"{name}: terminations", expected="booleans", actual=f"values such as {terminated.max()}"
             )
-        table = cls(rows, s.shape[1], a.shape[1], np.zeros(len(s), dtype=np.int64), name)
-        table.episode_ids = table._episodes_by_continuity() if ids is None else ids
-        return table
+        ny, nu = s.shape[1], a.shape[1]
+        return cls(rows, ny, nu, episodes_by_continuity(rows, ny, nu) if ids is None else ids, name)
 
     @classmethod
     def of(cls, data: TransitionTable | MinariDataset | str) -> TransitionTable:
@@ -386,12 +394,7 @@ class TransitionTable:
 
     @classmethod
     def _of_file(cls, file: TableFile, name: str, memory: int | None) -> TransitionTable:
-        return cls(file.rows, file.ny, file.nu, file.episode_ids, name, file=file, memory=memory)
+        return cls(file.raw_rows, file.ny, file.nu, file.raw_ids, name, file=file, memory=memory)
 
     def _row(self, values: NDArray[np.float64]) -> Columns:
         return Columns(*(column[0] for column in self.columns(values[None, :])))
-
-    def _episodes_by_continuity(self) -> NDArray[np.int64]:
-        goes_on = (self.next_observations[:-1] == self.observations[1:]).all(axis=1)
-        starts = ~goes_on | (self.terminations[:-1] > 0.0)
-        return np.concatenate([[0], np.cumsum(starts)]).astype(np.int64)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Set
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,9 @@ from numpy.typing import NDArray
 
 from mpcoffline.errors import FileFormatError
 
-from .manifest import MANIFEST, differences
+from .manifest import MANIFEST, differences, write_manifest
 from .minari_store import check_dataset_id, dataset_path, is_local, load_dataset
+from .opening import DATA_FILE, faults_of, open_to_examine
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -111,8 +111,8 @@ class VerifyReport:
         return [f"... and {hidden} more"] if hidden > 0 else []
 
 
-def verify(dataset: MinariDataset | str) -> VerifyReport:
-    """Checks a data set without changing it, and without importing anything that its files name.
+def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyReport:
+    """Checks a data set without changing its data, and without importing anything that its files name.
 
     * structure: Minari can read it, its counts are true, episode ids are 0, 1, ..., and nothing points to other files;
     * hash: the files are those of the manifest, where there is one;
@@ -124,6 +124,8 @@ def verify(dataset: MinariDataset | str) -> VerifyReport:
 
     Args:
         dataset: The data set, or the id of one in the local store or shipped with this package.
+        accept: Whether its files, as they are now, get a new manifest where nothing but the old one speaks against
+            them: after Minari's own tools, or you, have changed a data set on purpose. The report says that it was so.
 
     Returns:
         The report. Damage is a finding, not an exception.
@@ -132,67 +134,74 @@ def verify(dataset: MinariDataset | str) -> VerifyReport:
         InvalidArgumentError: For an id against Minari's grammar.
         UnknownIdError: For the id of no data set here.
     """
-    if not isinstance(dataset, str):
-        return _report(dataset, dataset.spec.dataset_id, Path(dataset.spec.data_path).parent)
-    check_dataset_id(dataset)
-    folder = dataset_path(dataset)
-    if not is_local(dataset):
-        return _report(load_dataset(dataset, download=False), dataset, folder)
+    if not isinstance(dataset, str) and hasattr(dataset, "iterate_episodes"):
+        dataset_id, folder = str(dataset.spec.dataset_id), Path(dataset.spec.data_path).parent
+    else:
+        check_dataset_id(dataset)
+        dataset_id, folder = str(dataset), dataset_path(str(dataset))
     try:
-        return _report(open_dataset(folder), dataset, folder)
-    except FileFormatError as error:
+        if isinstance(dataset, str) and is_local(dataset_id):
+            dataset, faults = open_to_examine(folder)
+        else:
+            dataset = load_dataset(dataset_id, download=False) if isinstance(dataset, str) else dataset
+            faults = faults_of(folder)
+        report = _report(dataset, dataset_id, folder, faults)
+    except (FileFormatError, OSError) as error:
         hashed, findings = _hash_findings(folder)
-        return VerifyReport(dataset, 0, 0, hashed, (Finding("structure", str(error)), *findings))
+        report = VerifyReport(dataset_id, 0, 0, hashed, (Finding("structure", str(error)), *findings))
+    serious = {finding.check for finding in report.findings if finding.serious}
+    if not accept or serious != {"hash"}:
+        return report
+    write_manifest(folder)
+    kept = tuple(replace(f, serious=False) if f.check == "hash" else f for f in report.findings)
+    return replace(report, findings=(*kept, Finding("hash", f"accepted: {MANIFEST} is written anew", serious=False)))
 
 
-def open_dataset(folder: Path) -> MinariDataset:
-    """Opens the data set of a folder, anywhere, without importing the environment that it names.
-
-    Minari makes the environment, and so imports what ``metadata.json`` says, where the spaces are not stored.
-
-    Args:
-        folder: The folder that holds ``data``.
-
-    Raises:
-        FileFormatError: For anything that Minari cannot read, or would have to import something for.
-    """
-    from minari import MinariDataset
-
-    path = folder / "data" / "metadata.json"
-    try:
-        metadata = json.loads(path.read_bytes())
-        missing = [key for key in ("observation_space", "action_space") if not isinstance(metadata.get(key), str)]
-        if not missing:
-            return MinariDataset(folder / "data")
-    except Exception as error:  # json, assertions, lookups, versions: whatever a damaged file makes Minari do
-        raise FileFormatError(
-            f"data set in {folder}", expected="a complete Minari data set", actual=f"{type(error).__name__}: {error}"
-        ) from error
-    raise FileFormatError(
-        str(path), expected=f"a stored {missing[0]}", actual="none", hint="Minari would import its environment."
-    )
-
-
-def _report(dataset: MinariDataset, dataset_id: str, folder: Path) -> VerifyReport:
-    findings = _structure_findings(dataset, dataset_id)
+def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[str, str]) -> VerifyReport:
+    findings = [Finding("structure", fault, _number(name)) for name, fault in faults.items()]
+    faulty = {number for number in map(_number, faults) if number is not None}
+    findings += _looked_at("structure", None, lambda: _structure_findings(dataset, dataset_id, faulty))
     hashed, changed = _hash_findings(folder)
     findings += changed
     steps = 0
-    for number, episode in _episodes(dataset):
+    for number, episode in _episodes(dataset, faulty):
         if isinstance(episode, Exception):
             findings.append(Finding("structure", f"unreadable: {type(episode).__name__}: {episode}", number))
             continue
-        steps += len(episode.rewards)
-        findings += _episode_findings(dataset, episode)
-    if dataset.total_episodes == dataset.storage.total_episodes and steps != dataset.storage.total_steps:
-        found = f"expected the metadata's {dataset.storage.total_steps} steps, got {steps}"
-        findings.append(Finding("structure", found))
-    return VerifyReport(dataset_id, dataset.total_episodes, steps, hashed, tuple(findings))
+        try:
+            steps += len(episode.rewards)
+        except TypeError:  # the alignment says so
+            steps = -1
+        findings += _looked_at("alignment", number, lambda episode=episode: _episode_findings(dataset, episode))  # type: ignore[misc]
+    findings += _looked_at("structure", None, lambda: _count_findings(dataset, steps))
+    return VerifyReport(dataset_id, dataset.total_episodes, max(steps, 0), hashed, tuple(findings))
 
 
-def _episodes(dataset: MinariDataset) -> Iterator[tuple[int, Any]]:
-    """Each episode's id with its data, or with what was raised in reading it."""
-    left = [int(index) for index in dataset.episode_indices]
+def _number(group: str) -> int | None:
+    """The number of an episode's group; None for a group of another name."""
+    digits = group.removeprefix("episode_")
+    return int(digits) if group != digits and digits.isdecimal() and len(digits) < 19 else None
+
+
+def _looked_at(check: str, episode: int | None, find: Callable[[], Iterable[Finding]]) -> list[Finding]:
+    """What a check finds; what it stumbles over is a finding too: no file's content is an exception here."""
+    found: list[Finding] = []
+    try:
+        found.extend(find())
+    except Exception as error:  # references, texts, compounds, other ranks: what a check was not made for
+        found.append(Finding(check, f"not what can be checked: {type(error).__name__}: {error}", episode))
+    return found
+
+
+def _count_findings(dataset: MinariDataset, steps: int) -> Iterator[Finding]:
+    storage = dataset.storage
+    if dataset.total_episodes == storage.total_episodes and steps != storage.total_steps:
+        yield Finding("structure", f"expected the metadata's {storage.total_steps} steps, got {steps}")
+
+
+def _episodes(dataset: MinariDataset, faulty: Set[int]) -> Iterator[tuple[int, Any]]:
+    """The id of each episode that may be read with its data, or with what was raised in reading it."""
+    left = [int(index) for index in dataset.episode_indices if int(index) not in faulty]
     while left:
         reader = iter(dataset.iterate_episodes(list(left)))  # one for all: each opens the file anew
         while left:
@@ -209,30 +218,29 @@ def _hash_findings(folder: Path) -> tuple[bool, list[Finding]]:
         return True, [Finding("hash", str(difference)) for difference in differences(folder)]
     except FileNotFoundError:
         return False, []
-    except FileFormatError as error:
+    except (FileFormatError, OSError) as error:
         return True, [Finding("hash", str(error))]
 
 
-def _structure_findings(dataset: MinariDataset, dataset_id: str) -> list[Finding]:
-    findings = []
+def _structure_findings(dataset: MinariDataset, dataset_id: str, faulty: Set[int]) -> Iterator[Finding]:
     if dataset.spec.dataset_id != dataset_id:
-        findings.append(Finding("structure", f"expected the id of its folder, got {dataset.spec.dataset_id!r}"))
+        yield Finding("structure", f"expected the id of its folder, got {dataset.spec.dataset_id!r}")
     if dataset.total_episodes == 0:
-        findings.append(Finding("structure", "expected at least one episode, got none"))
-    file_path = Path(dataset.spec.data_path) / "main_data.hdf5"
-    if file_path.exists():
-        try:
-            with h5py.File(file_path, "r") as file:
-                findings += _hdf5_findings(file, dataset.storage.total_episodes)
-        except (OSError, RuntimeError, KeyError) as error:
-            findings.append(Finding("structure", f"{file_path.name} is damaged: {error}"))
-    return findings
+        yield Finding("structure", "expected at least one episode, got none")
+    path = Path(dataset.spec.data_path) / DATA_FILE
+    if not path.exists():
+        return
+    try:
+        with h5py.File(path, "r") as file:
+            yield from _hdf5_findings(file, dataset.storage.total_episodes, faulty)
+    except (OSError, RuntimeError, KeyError) as error:
+        yield Finding("structure", f"{path.name} is damaged: {error}")
 
 
-def _hdf5_findings(file: h5py.File, episodes: int) -> Iterator[Finding]:
+def _hdf5_findings(file: h5py.File, episodes: int, faulty: Set[int]) -> Iterator[Finding]:
     names = set(file)
-    wanted = {f"episode_{i}" for i in range(episodes)}
-    if names != wanted:
+    wanted = {f"episode_{i}" for i in range(min(episodes, len(names) + SHOWN))}
+    if names != wanted or episodes != len(wanted):
         odd = sorted(names ^ wanted)
         yield Finding(
             "structure",
@@ -242,9 +250,7 @@ def _hdf5_findings(file: h5py.File, episodes: int) -> Iterator[Finding]:
     seen: dict[int, str] = {}
     for name in sorted(names & wanted, key=lambda name: int(name[8:])):
         number = int(name[8:])
-        outside = _points_elsewhere(file, name)
-        if outside is not None:
-            yield Finding("structure", f"expected data in this file, got a link in {outside!r}", number)
+        if number in faulty:
             continue
         found = int(file[name].attrs.get("id", number))
         if found in seen:
@@ -252,16 +258,6 @@ def _hdf5_findings(file: h5py.File, episodes: int) -> Iterator[Finding]:
         elif found != number:
             yield Finding("structure", f"expected the episode id {number}, got {found}", number)
         seen.setdefault(found, name)
-
-
-def _points_elsewhere(group: Any, name: str) -> str | None:
-    """The path of the first member that lives in another file or place; None where all is here."""
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        return f"{group.name}/{name}"
-    member = group[name]
-    if isinstance(member, h5py.Group):
-        return next((found for key in member if (found := _points_elsewhere(member, key)) is not None), None)
-    return str(member.name) if isinstance(member, h5py.Dataset) and (member.external or member.is_virtual) else None
 
 
 def _episode_findings(dataset: MinariDataset, episode: Any) -> Iterator[Finding]:
@@ -279,6 +275,9 @@ def _episode_findings(dataset: MinariDataset, episode: Any) -> Iterator[Finding]
         if space is not None and not isinstance(space, spaces.Box):
             continue  # Dict, Tuple, Text: nothing that an MPC could learn from
         array = arrays[name] = np.asarray(values)
+        if array.dtype.kind not in "fiub":
+            yield Finding("alignment", f"{name}: expected numbers, got {array.dtype}", number)
+            return
         wanted = (length, *space.shape) if space is not None else (length, *array.shape[1:])
         if array.shape != wanted or steps == 0:
             yield Finding("alignment", f"{name}: expected shape {wanted} of T >= 1 steps, got {array.shape}", number)

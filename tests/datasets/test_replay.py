@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from pendulum_data import PENDULUM, recorded, stored
+from pendulum_data import PENDULUM, recorded, resealed, stored
 from rich.console import Console
 
 from mpcoffline.datasets.minari_store import write_dataset
@@ -91,6 +91,7 @@ def test_another_plant_is_noticed() -> None:
     assert replay(dataset).bitwise
     path = Path(dataset.spec.data_path) / "metadata.json"
     path.write_text(path.read_text().replace('\\"alpha\\": 0.5', '\\"alpha\\": 0.6'))
+    resealed("test/alpha-v0")
     report = replay("test/alpha-v0")
     assert not report.ok
     assert report.one_step["state"].absolute > 1e-3
@@ -193,6 +194,7 @@ def test_nothing_is_imported_that_a_file_names(evil: Path, way: str) -> None:
         spec["id"] = {"registered id": PENDULUM, "entry point": "evil/Env-v0"}.get(way, f"{EVIL}:evil/Env-v0")
     metadata["env_spec"] = json.dumps(spec)
     path.write_text(json.dumps(metadata))
+    resealed()
     with pytest.raises((UnknownIdError, InvalidDataError), match=r"data set 'test/set-v0'.*environment"):
         replay("test/set-v0")
     assert EVIL not in sys.modules
@@ -206,6 +208,7 @@ def test_a_missing_module_is_named() -> None:
     dataset = stored()
     path = Path(dataset.spec.data_path) / "metadata.json"
     path.write_text(path.read_text().replace("mpcoffline.envs.pendulum_swing_up", "not_here.pendulum"))
+    resealed()
     with pytest.raises(UnknownIdError, match=r"not_here\.pendulum.*allow_import"):
         replay("test/set-v0")
     with pytest.raises(InvalidDataError, match=r"No module named 'not_here'.*Install the package"):

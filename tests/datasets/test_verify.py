@@ -203,7 +203,7 @@ def test_odd_groups_ids_and_links_are_found(store: Path, tmp_path: Path) -> None
     lines = str(verify("test/set-v0"))
     assert "missing or odd: episode_3, episode_9" in lines
     assert "episode 1: expected an episode id of its own, got 0 as in episode_0" in lines
-    assert "episode 2: expected data in this file, got a link in '/episode_2/rewards'" in lines
+    assert "/episode_2/rewards: expected data in this file, got a link" in lines
     assert "episode 3: unreadable" in lines
 
 

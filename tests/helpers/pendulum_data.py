@@ -10,7 +10,8 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
-from mpcoffline.datasets.minari_store import write_dataset
+from mpcoffline.datasets.manifest import write_manifest
+from mpcoffline.datasets.minari_store import dataset_path, write_dataset
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 
@@ -61,3 +62,8 @@ def stored(
     env = gym.make(env_id, **({} if alpha is None else {"alpha": alpha}))
     given = {"env_spec": env.spec, "observation_space": env.observation_space, "action_space": env.action_space}
     return write_dataset(dataset_id, arguments.pop("episodes", None) or recorded(), **{**given, **arguments})
+
+
+def resealed(dataset_id: str = "test/set-v0") -> None:
+    """Writes the manifest of a data set anew: what a test changed of its files is no damage."""
+    write_manifest(dataset_path(dataset_id))
