@@ -77,7 +77,7 @@ def cache_folders(kind: str) -> Iterator[Path]:
 
 
 def private_folder(folder: Path, kind: str) -> Path:
-    """A folder that a user chose, made if need be; a temporary one where others own it or can write it.
+    """A folder that a user chose; a temporary one where it exists and others own it or can write it.
 
     Args:
         folder: The folder.
@@ -86,7 +86,7 @@ def private_folder(folder: Path, kind: str) -> Path:
     Raises:
         StorageError: Where there is no such folder.
     """
-    return folder if _is_made_private(folder) else _temporary_folder(kind)
+    return folder if not folder.exists() or _is_made_private(folder) else _temporary_folder(kind)
 
 
 def open_own(path: Path) -> int:

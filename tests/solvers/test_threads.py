@@ -60,7 +60,7 @@ def test_threads_share_a_solver(name: str, n: int) -> None:
 
 
 def test_the_first_solves_of_threads_build_what_they_need_once() -> None:
-    """The recursions of many thetas, and the program of stagewise thetas, are built at the first solve that needs them."""
+    """The program of stagewise thetas is built at the first solve that needs it."""
     mpc = pendulum()
     rng, x = np.random.default_rng(0), np.array([[0.5, 0.0]])
     along = mpc.theta * rng.uniform(1.0, 1.1, size=(4, 1, mpc.horizon + 1, mpc.space.size))
