@@ -5,11 +5,10 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -101,24 +100,37 @@ def _optional_packages() -> Iterator[Check]:
 
 
 def _compiler() -> Iterator[Check]:
-    from mpcoffline.solvers.ddp.build import FLAGS, CompilerError, cache_folder, find_compiler
+    from mpcoffline.solvers.ddp import build
 
     advice = "Install gcc or clang, or name one in CC: without one ipopt solves, hundreds of times slower."
-    try:
-        compiler = find_compiler()
-        message = _compilation(compiler, FLAGS)
-        if message:
-            yield Check("C compiler", "warn", f"{compiler} fails: {message}", advice)
+    found = build.compilers()
+    for compiler in found:
+        if reason := build.trial(compiler):
+            yield Check("C compiler", "warn", f"{compiler} fails: {reason.splitlines()[0]}", advice)
         else:
-            yield Check("C compiler", "ok", f"{compiler} {' '.join(FLAGS)}")
-    except CompilerError as error:
-        yield Check("C compiler", "warn", error.actual, advice)
-    folder = cache_folder()
-    writable = _writable(folder)
-    advice = (
-        "" if writable else "Set MPCOFFLINE_CACHE to a folder that can be written; solvers compile in each process."
-    )
-    yield Check("cache of solvers", "ok" if writable else "warn", str(folder), advice)
+            yield Check("C compiler", "ok", f"{compiler} {' '.join(build.flags_of(compiler))}")
+            break
+    if not found:
+        yield Check("C compiler", "warn", "none", advice)
+
+
+def _cache() -> Iterator[Check]:
+    from mpcoffline.core.caches import disk_size, size_limit
+    from mpcoffline.core.places import cache_root, distrusted
+
+    folder = cache_root()
+    advice = "Set MPCOFFLINE_CACHE to a folder of yours: temporary files take its place."
+    if folder is None:
+        yield Check("cache", "warn", "no home directory", advice)
+        return
+    problem = distrusted(folder) if folder.exists() else ""
+    if not problem and not _writable(folder):
+        problem = "cannot be written"
+    found = f"{folder}, {disk_size(folder) / 1e6:.0f} MB of at most {size_limit() / 1e6:.0f}"
+    if problem:
+        yield Check("cache", "warn", f"{found}; it {problem}", advice)
+    else:
+        yield Check("cache", "ok", found)
 
 
 def _solvers() -> Iterator[Check]:
@@ -175,7 +187,7 @@ def _hardware() -> Iterator[Check]:
     yield Check("threads", "warn" if many else "ok", found, advice)
 
 
-_EXAMINATIONS = (_versions, _optional_packages, _compiler, _solvers, _data_sets, _hardware)
+_EXAMINATIONS = (_versions, _optional_packages, _compiler, _cache, _solvers, _data_sets, _hardware)
 
 
 def _needed() -> list[Requirement]:
@@ -191,16 +203,6 @@ def _version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _compilation(compiler: str, flags: Sequence[str]) -> str:
-    """What a compiler says against a program of one line; empty if nothing."""
-    with tempfile.TemporaryDirectory() as folder:
-        code = Path(folder) / "tiny.c"
-        code.write_text("int tiny(void) { return 0; }\n", encoding="utf-8")
-        command = [compiler, *flags, str(code), "-o", str(code.with_suffix(".so"))]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-        return (done.stderr.strip().splitlines() or ["no message"])[0] if done.returncode else ""
 
 
 def _writable(folder: Path) -> bool:

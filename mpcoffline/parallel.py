@@ -119,7 +119,7 @@ class Workers(Generic[Job, Result]):
     def __init__(self, fn: Callable[[Job], Result], n: int) -> None:
         self._workers = _start_workers(fn, n)
         # Also runs when the object is forgotten, and when the interpreter ends.
-        self._stop = weakref.finalize(self, _end_all, self._workers)
+        self._stop = weakref.finalize(self, _end_all, self._workers, os.getpid())
 
     def __enter__(self) -> Self:
         return self
@@ -157,7 +157,9 @@ class Workers(Generic[Job, Result]):
         self._stop()
 
 
-def _end_all(workers: dict[Connection, multiprocessing.context.SpawnProcess]) -> None:
+def _end_all(workers: dict[Connection, multiprocessing.context.SpawnProcess], owner: int) -> None:
+    if os.getpid() != owner:  # a fork of the process that started them, and still uses them
+        return
     for connection in workers:
         with suppress(OSError):  # it may have died
             connection.send(None)

@@ -11,9 +11,9 @@ import itertools
 import json
 import os
 import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
+from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError, UnknownIdError
 
 from .atomic import publish, sync_tree
@@ -243,10 +244,11 @@ def write_dataset(
         raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
     target = dataset_path(dataset_id)
     metadata = {RECORDING: recording}
+    scratch = ExitStack()
     try:
         if building is None:
             # Hidden from Minari's listing; in the store, so that the rename stays in one file system.
-            building = Path(tempfile.mkdtemp(prefix=".building-", dir=dataset_path("")))
+            building = scratch.enter_context(scratch_folder(dataset_path("")))
         building.mkdir(exist_ok=True)
         data = building / "data"
         if extend:
@@ -275,6 +277,7 @@ def write_dataset(
     finally:
         if building is not None:
             shutil.rmtree(building, ignore_errors=True)
+        scratch.close()
     return open_dataset(target, sums=False)
 
 

@@ -16,7 +16,7 @@ from mpcoffline.errors import FileFormatError, InvalidDataError, StorageError
 from .checks import check_finite
 from .hdf5_episodes import EpisodeColumns, read_episodes
 from .opening import DATA_FILE, check_stored
-from .table_cache import TableFile, cached_table, content_key, scratch_table
+from .table_cache import TableFile, cached_table, content_key, scratch_table, table_folder
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -36,10 +36,11 @@ class BuiltRows(NamedTuple):
     nu: int
 
 
-def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path) -> BuiltRows | TableFile:
+def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path | None) -> BuiltRows | TableFile:
     """The packed rows of a data set, in memory or, if larger than ``memory`` bytes, in a file.
 
-    From :data:`CACHED_ROWS` on they come from the cache, where it holds them intact, and are put there otherwise.
+    From :data:`CACHED_ROWS` on they come from the cache (None: the user's), where it holds them intact, and are put
+    there otherwise.
 
     Raises:
         InvalidDataError: For data that must not be learned from.
@@ -57,8 +58,9 @@ def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path) -> 
     mapped = steps * 4 * (2 * ny + nu + 2) > memory
     path = _hdf5_file(dataset)
     if mapped and path is None:
-        return scratch_table(ny, nu, row_blocks(dataset, name, ny, nu), cache)
+        return scratch_table(ny, nu, row_blocks(dataset, name, ny, nu), table_folder(cache))
     if path is not None and (mapped or steps >= CACHED_ROWS):
+        cache = table_folder(cache)
         try:
             file = _cached(dataset, name, ny, nu, path, cache)
             if mapped:

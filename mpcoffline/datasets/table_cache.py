@@ -12,18 +12,21 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 import weakref
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.core.files import check_regular, read_limited
-from mpcoffline.core.limits import TABLE_META_BYTES
+from mpcoffline.core.caches import mark_used, trim
+from mpcoffline.core.files import read_limited
+from mpcoffline.core.limits import TABLE_META_BYTES, check_limit
+from mpcoffline.core.places import cache_folder, open_own, private_folder
+from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.errors import FileFormatError, StorageError
 
 from .atomic import publish
@@ -54,23 +57,25 @@ class TableFile:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
-            meta = json.loads(read_limited(folder / _META, TABLE_META_BYTES))
-            for name in (_ROWS, _IDS):
-                check_regular(folder / name)
+            with os.fdopen(open_own(folder / _META), encoding="utf-8") as meta_file:
+                size = os.fstat(meta_file.fileno()).st_size
+                check_limit(str(folder / _META), "bytes", size, TABLE_META_BYTES)
+                meta = json.loads(meta_file.read(size))
             if meta["version"] != VERSION:
                 raise ValueError(f"version {meta['version']}")
             self.ny, self.nu, n = int(meta["ny"]), int(meta["nu"]), int(meta["rows"])
             self.block_rows, self._crcs = int(meta["block_rows"]), [int(crc) for crc in meta["crcs"]]
             self._ids_crc = int(meta["ids_crc"])
-            self._fd = os.open(folder / _ROWS, os.O_RDONLY | os.O_CLOEXEC)
+            self._fd = open_own(folder / _ROWS)
             weakref.finalize(self, os.close, self._fd)
             shape = (n, 2 * self.ny + self.nu + 2)
             self.row_bytes = 4 * shape[1]
-            sizes = (os.fstat(self._fd).st_size, (folder / _IDS).stat().st_size)
-            if sizes != (n * self.row_bytes, 8 * n) or len(self._crcs) != -(-n // self.block_rows):
-                raise ValueError(f"files of {sizes} bytes for {n} rows")
-            self.raw_rows: NDArray[np.float32] = np.memmap(folder / _ROWS, np.float32, "r", shape=shape)
-            self.raw_ids: NDArray[np.int64] = np.memmap(folder / _IDS, np.int64, "r", shape=(n,))
+            with os.fdopen(open_own(folder / _IDS), "rb") as ids_file, os.fdopen(os.dup(self._fd), "rb") as rows_file:
+                sizes = (os.fstat(self._fd).st_size, os.fstat(ids_file.fileno()).st_size)
+                if sizes != (n * self.row_bytes, 8 * n) or len(self._crcs) != -(-n // self.block_rows):
+                    raise ValueError(f"files of {sizes} bytes for {n} rows")
+                self.raw_rows: NDArray[np.float32] = np.memmap(rows_file, np.float32, "r", shape=shape)
+                self.raw_ids: NDArray[np.int64] = np.memmap(ids_file, np.int64, "r", shape=(n,))
         except (OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
             raise self._damaged(f"{type(error).__name__}: {error}") from error
         self._ids_checked = False
@@ -199,6 +204,8 @@ def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[A
         meta = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
         meta |= {"block_rows": block_bytes // row_bytes, "ids_crc": ids_crc}
         (folder / _META).write_text(json.dumps({**meta, "crcs": crcs}), encoding="utf-8")
+        for name in (_ROWS, _IDS, _META):
+            (folder / name).chmod(0o600)  # whatever the umask: see open_own
     except OSError as error:
         raise StorageError.of(folder, error) from error
 
@@ -213,22 +220,24 @@ def cached_table(
     """
     target = cache / key
     try:
-        return TableFile(target)
+        file = TableFile(target)
+        mark_used(target)
+        return file
     except FileFormatError:
         shutil.rmtree(target, ignore_errors=True)
-    building = _scratch_folder(cache)
-    try:
-        write_table(building, ny, nu, blocks)
+    with _scratch_folder(cache) as building:
         try:
-            publish(building, target, overwrite=False)
-        except OSError:
-            if not target.exists():  # otherwise another process was faster: its table is as good
-                raise
-        return TableFile(target)
-    except OSError as error:
-        raise error if isinstance(error, StorageError) else StorageError.of(target, error) from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+            write_table(building, ny, nu, blocks)
+            try:
+                publish(building, target, overwrite=False)
+            except OSError:
+                if not target.exists():  # otherwise another process was faster: its table is as good
+                    raise
+            file = TableFile(target)
+        except OSError as error:
+            raise error if isinstance(error, StorageError) else StorageError.of(target, error) from error
+    trim(keep=target)
+    return file
 
 
 def scratch_table(ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path) -> TableFile:
@@ -237,12 +246,11 @@ def scratch_table(ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray
     Raises:
         StorageError: Where the disk refuses.
     """
-    folder = _scratch_folder(cache)
-    try:
+    with _scratch_folder(cache) as folder:
         write_table(folder, ny, nu, blocks)
-        return TableFile(folder)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        file = TableFile(folder)
+    file.folder = cache / folder.parent.name
+    return file
 
 
 def content_key(path: Path, episodes: NDArray[Any] | None, cache: Path) -> str:
@@ -277,9 +285,16 @@ def content_key(path: Path, episodes: NDArray[Any] | None, cache: Path) -> str:
     return hashlib.sha256(digest.encode() + chosen).hexdigest()[:40]
 
 
-def default_cache() -> Path:
-    """``mpcoffline/tables`` in the user's cache folder; it can be removed at any time."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mpcoffline" / "tables"
+def table_folder(chosen: Path | None) -> Path:
+    """Where tables are kept, in a folder of the user's alone; it can be removed at any time.
+
+    Args:
+        chosen: The folder; None for ``tables`` in that of all caches.
+
+    Raises:
+        StorageError: Where there is no folder to keep anything in.
+    """
+    return cache_folder("tables") if chosen is None else private_folder(chosen, "tables")
 
 
 def default_memory() -> int:
@@ -292,9 +307,11 @@ def _bytes(array: Any) -> memoryview:
     return memoryview(array.reshape(-1)).cast("B")
 
 
-def _scratch_folder(cache: Path) -> Path:
+@contextmanager
+def _scratch_folder(cache: Path) -> Iterator[Path]:
     try:
-        cache.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=".building-", dir=cache))
+        cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with scratch_folder(cache) as folder:
+            yield folder
     except OSError as error:
-        raise StorageError.of(cache, error) from error
+        raise error if isinstance(error, StorageError) else StorageError.of(cache, error) from error

@@ -15,7 +15,7 @@ from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 from .checks import check_finite, checked_episode_ids, floats, place
 from .sampler import block_batches, gather_batches
 from .table_build import read_minari
-from .table_cache import TableFile, default_cache, default_memory, scratch_table
+from .table_cache import TableFile, default_memory, scratch_table
 from .table_math import CHUNK, Columns, TableStatistics, episodes_by_continuity, innermost, moments
 
 __all__ = ["Columns", "TableStatistics", "TransitionTable"]
@@ -206,7 +206,8 @@ class TransitionTable:
         Args:
             dataset: The data set, or its id (local or shipped).
             memory: Bytes; by default a quarter of the machine's memory.
-            cache: The cache's folder; by default ``mpcoffline/tables`` in the user's cache folder.
+            cache: The cache's folder; by default ``tables`` in that of all caches (``MPCOFFLINE_CACHE``). One that
+                others own or can write is not used, but a temporary one.
 
         Raises:
             UnknownIdError: For an unknown id.
@@ -221,7 +222,7 @@ class TransitionTable:
             dataset = load_dataset(dataset)
         name = f"data set {dataset.spec.dataset_id!r}"
         memory = default_memory() if memory is None else memory
-        built = read_minari(dataset, name, memory, default_cache() if cache is None else Path(cache))
+        built = read_minari(dataset, name, memory, None if cache is None else Path(cache))
         if isinstance(built, TableFile):
             return cls._of_file(built, name, memory)
         return cls(built.rows, built.ny, built.nu, built.episode_ids, name)

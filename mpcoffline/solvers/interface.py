@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import threading
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,11 +92,33 @@ class Solution:
         return Solution(self.u0[0], self.x[0], self.u[0], self.value[0], self.success[0], self.status, stats)
 
 
+class OneAtATime:
+    """A lock that threads of one process share; in a forked child it is open."""
+
+    def __init__(self) -> None:
+        self._lock, self._process = threading.RLock(), os.getpid()
+
+    def __enter__(self) -> None:
+        """Waits until no other thread is within."""
+        if self._process != os.getpid():  # a fork: whoever was within is not here
+            self._lock, self._process = threading.RLock(), os.getpid()
+        self._lock.acquire()
+
+    def __exit__(self, *exception: object) -> None:
+        """Lets the next thread in."""
+        self._lock.release()
+
+
 class Solver(ABC):
     """Solves (MPC) for batches of states.
 
+    Threads may share a solver: equal calls give equal results. ddp solves for all of them at once; lqr and ipopt, whose
+    libraries keep what they work on in one place, for one after the other. A copy is the solver itself, as nothing in
+    it changes; an unpickled one is built anew, from an MPC that has a JSON form.
+
     Args:
         mpc: The problem. Its parameters are the default ``theta``; another theta never rebuilds the solver.
+        **options: With which a subclass was made, to be made again in another process.
 
     Attributes:
         mpc: The problem.
@@ -107,9 +131,29 @@ class Solver(ABC):
     theta_dimensions: ClassVar[tuple[int, ...]] = (1,)
     reason: str = ""
 
-    def __init__(self, mpc: MPC) -> None:
-        self.mpc = mpc
+    def __init__(self, mpc: MPC, **options: Any) -> None:
+        self.mpc, self._made_with = mpc, options
         self._theta = mpc.theta
+
+    def __copy__(self) -> Self:
+        """The solver itself."""
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """The solver itself."""
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How another process makes it again.
+
+        Raises:
+            InvalidArgumentError: For an MPC that cannot be written to JSON.
+        """
+        try:
+            document = self.mpc.to_json()
+        except AttributeError as error:  # an own cost
+            raise InvalidArgumentError("mpc", expected="one that has a JSON form", actual=str(error)) from error
+        return _made_again, (type(self), document, self._made_with), {"reason": self.reason}
 
     def __repr__(self) -> str:
         """Its class and the sizes of its problem."""
@@ -200,6 +244,10 @@ class Solver(ABC):
         if ((inputs < low - slack) | (inputs > high + slack)).any():
             raise InvalidArgumentError("u0", expected=f"inputs from {low} to {high}", actual=str(inputs))
         return np.clip(inputs, low, high)
+
+
+def _made_again(kind: type[Solver], document: dict[str, Any], options: dict[str, Any]) -> Solver:
+    return kind(MPC.from_json(document), **options)
 
 
 def _checked(name: str, value: ArrayLike, size: int) -> Array:

@@ -14,7 +14,7 @@ from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
-from .interface import Array, Plan, Solution, Solver
+from .interface import Array, OneAtATime, Plan, Solution, Solver
 from .linear_quadratic import Extraction, LinearQuadratic, Riccati, misfit
 from .nlp import IpoptSolver
 
@@ -57,7 +57,7 @@ class LQRSolver(Solver):
     theta_dimensions = (1, 2, 3)
 
     def __init__(self, mpc: MPC, *, cache_size: int = 8) -> None:
-        super().__init__(mpc)
+        super().__init__(mpc, cache_size=cache_size)
         if (reason := misfit(mpc)) is not None:
             raise InvalidArgumentError(
                 "mpc",
@@ -71,13 +71,15 @@ class LQRSolver(Solver):
         self._cache: OrderedDict[bytes, _Controller] = OrderedDict()
         self._cache_size = cache_size
         self._ipopt: IpoptSolver | None = None
+        self._alone = OneAtATime()
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
-        if theta.ndim == 1:
-            solution = self._solve_with(theta, x, u0, warm_start)
-        else:
-            solution = self._solve_each(theta, x, u0, warm_start)
+        with self._alone:  # daqp works in memory that a solver has once
+            if theta.ndim == 1:
+                solution = self._solve_with(theta, x, u0, warm_start)
+            else:
+                solution = self._solve_each(theta, x, u0, warm_start)
         solution.stats["time"] = time.perf_counter() - start
         return solution
 

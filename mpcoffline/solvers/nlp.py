@@ -14,7 +14,7 @@ from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
-from .interface import Array, Plan, Solution, Solver
+from .interface import Array, OneAtATime, Plan, Solution, Solver
 from .linear_quadratic import is_convex
 from .starts import N_CANDIDATES, candidate_inputs
 from .transcription import Multipliers, Transcription
@@ -58,7 +58,9 @@ class IpoptSolver(Solver):
         max_iterations: int = 300,
         n_workers: int = 1,
     ) -> None:
-        super().__init__(mpc)
+        super().__init__(
+            mpc, n_starts=n_starts, tolerance=tolerance, max_iterations=max_iterations, n_workers=n_workers
+        )
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
         check_integers(1, max_iterations=max_iterations, n_workers=n_workers)
@@ -69,6 +71,7 @@ class IpoptSolver(Solver):
             "max_iterations": max_iterations,
         }
         self._candidates = candidate_inputs(mpc)
+        self._alone = OneAtATime()
         self._pool = WorkerPool(mpc, self._options, n_workers) if n_workers > 1 else None
         if self._pool is None:
             _ = self._common  # built here, not at the first solve
@@ -86,10 +89,11 @@ class IpoptSolver(Solver):
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
         warm_start = warm_start or Plan.none(len(x), self.mpc)
-        if self._pool is not None and len(x) > 1:
-            found = self._pool.solve(x, theta, u0, warm_start)
-        else:
-            found = self.solve_each(x, theta, u0, warm_start)
+        with self._alone:  # CasADi's functions keep one state each: threads in them at once crash
+            if self._pool is not None and len(x) > 1:
+                found = self._pool.solve(x, theta, u0, warm_start)
+            else:
+                found = self.solve_each(x, theta, u0, warm_start)
         u = np.stack([one.u for one in found])
         stats: dict[str, Any] = {
             "iterations": np.array([one.iterations for one in found]),
@@ -118,7 +122,8 @@ class IpoptSolver(Solver):
     def close(self) -> None:
         """Ends the worker processes, if there are any; a later batch starts them again."""
         if self._pool is not None:
-            self._pool.close()
+            with self._alone:
+                self._pool.close()
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -49,6 +50,7 @@ class WorkerPool:
             ) from error
         self._task, self._n_workers = _Task(document, dict(options)), n_workers
         self._workers: Workers[_Part, list[Found]] | None = None
+        self._process = os.getpid()
 
     def solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
         """The solutions in the order of the problems."""
@@ -64,6 +66,8 @@ class WorkerPool:
             )
             for low, high in pairwise(edges)
         }
+        if self._process != os.getpid():  # a fork: the workers are its parent's
+            self._workers, self._process = None, os.getpid()
         if self._workers is None:
             self._workers = Workers(self._task, self._n_workers)
         try:

@@ -23,9 +23,9 @@ STATE = [[1.5]]
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache folder."""
+    """The folder of compiled solvers in an empty cache."""
     monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
+    return tmp_path / "cache" / "solvers"
 
 
 def tiny(weight: float = 1.0) -> MPC:
@@ -92,34 +92,54 @@ def test_a_damaged_library_is_built_again(cache: Path, damage: str, caplog: pyte
     assert library.read_bytes() == content
 
 
-@pytest.mark.parametrize(
-    ("script", "message"),
-    [
-        (None, "one of"),
-        ("#!/bin/sh\necho broken as can be >&2\nexit 1\n", "broken as can be"),
-        ("#!/bin/sh\nexit 0\n", "no output"),
-        ("this is no program\n", "(?i)format|expected a compiled solver"),
-        (
-            '#!/bin/sh\nwhile [ "$1" != -o ] && [ $# -gt 0 ]; do shift; done\n[ $# -gt 0 ] && echo no > "$2"\nexit 0\n',
-            "",
-        ),
-    ],
-    ids=["missing", "fails", "writes nothing", "no program", "writes rubbish"],
-)
-def test_a_broken_compiler(
-    script: str | None, message: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """ddp says so; "auto" says so once and goes on with another solver."""
+BROKEN = {
+    "fails": ("#!/bin/sh\necho broken as can be >&2\nexit 1\n", "broken as can be"),
+    "writes nothing": ("#!/bin/sh\nexit 0\n", "no output"),
+    "no program": ("this is no program\n", "(?i)format|cannot compile"),
+    "writes rubbish": (
+        '#!/bin/sh\nwhile [ "$1" != -o ] && [ $# -gt 0 ]; do shift; done\n[ $# -gt 0 ] && echo no > "$2"\nexit 0\n',
+        "cannot compile",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", [None, *BROKEN])
+def test_no_compiler_that_works(kind: str | None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ddp says so; "auto" says so once, what it costs and what to do, and goes on with another solver."""
+    script, message = BROKEN[kind] if kind else (None, "got none")
     monkeypatch.setenv("CC", compiler_script(tmp_path, script) if script else "no-such-compiler")
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
     with pytest.raises(CompilerError, match=message) as error:
         DDPSolver(tiny())
-    assert "Install" in str(error.value) or "Set CC" in str(error.value)
+    assert "Install gcc or clang" in str(error.value)
     assert not libraries(cache)
     plant = tiny().replace(model=Model(lambda x, u, p: x + u + 0.1 * x**2, 1, 1, 1.0, discrete=True))
-    with pytest.warns(UserWarning, match="C compiler"):
+    with pytest.warns(UserWarning, match="about 500 times slower.*C compiler.*Install gcc or clang"):
         solver = make_solver(plant, "auto")
     assert solver.name == "ipopt"
     assert solver.solve(STATE).success.all()
+
+
+@pytest.mark.parametrize("kind", [None, *BROKEN])
+def test_the_next_compiler_takes_the_place_of_one_that_does_not_work(
+    kind: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    given = compiler_script(tmp_path, BROKEN[kind][0]) if kind else f"{tmp_path}/no-such-compiler"
+    monkeypatch.setenv("CC", given)
+    assert DDPSolver(tiny()).solve(STATE).success.all()
+    assert given in caplog.text
+
+
+def test_a_working_compiler_that_fails_is_not_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What one compiler says against a model, the next would say again, minutes later."""
+    compiler = build.find_compiler()
+    monkeypatch.setenv("CC", compiler_script(tmp_path, f'#!/bin/sh\necho >> {tmp_path}/calls\nexec {compiler} "$@"\n'))
+    with pytest.raises(CompilerError, match="such nonsense"):
+        build.compiled("#error such nonsense\n")
+    assert len((tmp_path / "calls").read_text().splitlines()) == 3  # what it targets, the source, a trial
+    with pytest.raises(CompilerError, match="such nonsense"):
+        build.compiled("#error such nonsense\n")
+    assert len((tmp_path / "calls").read_text().splitlines()) == 4
 
 
 def test_a_compiler_without_march_native(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,14 +153,14 @@ def test_a_cache_that_cannot_be_written(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A file where the folder should be (a read-only folder would not stop root): solved without a cache, and said."""
-    cache.write_text("in the way")
+    cache.parent.write_text("in the way")
     assert DDPSolver(tiny()).solve(STATE).success.all()
     assert "cannot be used" in caplog.text
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_read_only_cache(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
-    cache.mkdir(mode=0o500)
+    cache.mkdir(mode=0o500, parents=True)
     assert DDPSolver(tiny()).solve(STATE).success.all()
     assert "cannot be used" in caplog.text
 
@@ -183,8 +203,7 @@ def test_a_build_that_is_killed_leaves_no_library(cache: Path, tmp_path: Path) -
     process.communicate()
     assert process.returncode == -9
     assert not libraries(cache)
-    (scratch,) = cache.iterdir()
-    os.utime(scratch, (0, 0))  # long ago
+    assert len(list(cache.iterdir())) == 1  # what was being built
     assert DDPSolver(tiny()).solve(STATE).success.all()
     assert [path.suffix for path in cache.iterdir()] == [".so"]
 

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
+import errno
 import functools
 import hashlib
+import itertools
 import logging
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
-import time
 from pathlib import Path
 
-from mpcoffline.errors import MPCOfflineError
+from mpcoffline.core.caches import mark_used, trim
+from mpcoffline.core.places import cache_folders, open_own, warn_once
+from mpcoffline.core.scratch import scratch_folder
+from mpcoffline.errors import MPCOfflineError, StorageError
 
 logger = logging.getLogger(__name__)
 
 # -ffast-math would set flush-to-zero for the whole process and drop the NaN checks; these do neither. A model's
 # derivatives are long straight lines of code, which scheduling by register pressure makes 15 % faster. Loops over
-# states and inputs are so short that unrolling all of them pays, nested ones too.
+# states and inputs are so short that unrolling all of them pays, nested ones too. A compiler that does not know one of
+# these flags, as clang, goes without it.
 FLAGS = (
     "-std=gnu11",
     "-O3",
@@ -34,18 +39,20 @@ FLAGS = (
     "-march=native",
 )
 _TIMEOUT = 300.0
-_SCRATCH = ".build-"
+_KIND = "solvers"
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_ENOUGH = 1 << 24  # bytes, for what a compiler writes
+# What the generated code needs of a compiler beyond C: vectors whose operators and elements work.
+_TRIAL = """
+typedef double vd __attribute__((vector_size(16)));
+typedef long long vl __attribute__((vector_size(16)));
+int trial(double a) { vd v = a - (vd){0}; vl m = v < 2.0 * v; return m[0] && v[1] > 0.0; }
+"""
+_loads = itertools.count()
 
 
 class CompilerError(MPCOfflineError, RuntimeError):
     """There is no working C compiler."""
-
-
-def cache_folder() -> Path:
-    """Where compiled solvers are kept: ``$MPCOFFLINE_CACHE``, else ``mpcoffline`` in the user's cache folder."""
-    if "MPCOFFLINE_CACHE" in os.environ:
-        return Path(os.environ["MPCOFFLINE_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mpcoffline"
 
 
 def compiled(source: str) -> ctypes.CDLL:
@@ -53,54 +60,105 @@ def compiled(source: str) -> ctypes.CDLL:
 
     The key holds the source, the flags, and the compiler with the processor features that it targets. A library is
     built in a temporary folder, sealed with a digest and renamed, so that processes may build the same one at once and
-    an interrupted or damaged one is never loaded.
+    an interrupted or damaged one is never loaded; nor is one that another user could have written. A compiler that
+    cannot compile anything of this kind is passed over for the next, with a warning.
 
     Raises:
-        CompilerError: If there is no compiler, or it fails.
+        CompilerError: If there is no compiler, or none that works, or a working one fails.
     """
-    compiler = find_compiler()
-    flags, target = _target(compiler)
-    key = hashlib.sha256("\0".join([source, *flags, target]).encode()).hexdigest()[:24]
-    folder = cache_folder()
-    library = folder / f"ddp-{key}.so"
+    refusals: list[str] = []
+    for compiler in compilers():
+        try:
+            library = _compiled_by(compiler, source)
+        except CompilerError:
+            reason = trial(compiler)
+            if not reason:
+                raise
+            refusals.append(f"{compiler} cannot compile vectors of doubles ({reason.splitlines()[0]})")
+            continue
+        if refusals:
+            warn_once(f"Compiling with {compiler}, as {'; '.join(refusals)}.")
+        return library
+    raise CompilerError(
+        "C compiler",
+        expected="one that works: in CC, or cc, gcc or clang on the PATH",
+        actual="; ".join(refusals) or "none",
+        hint="Install gcc or clang, or set CC to one.",
+    )
+
+
+def compilers() -> list[str]:
+    """The C compilers that are there, as command lines: ``$CC``, which may have arguments, then cc, gcc and clang."""
+    found = [path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))]
+    given = os.environ.get("CC", "").strip()
+    if not given:
+        return [shlex.quote(path) for path in found]
     try:
-        if library.exists():
-            if _is_sealed(library):
-                return ctypes.CDLL(str(library))
-            logger.warning("Rebuilding the damaged solver %s.", library)
-        folder.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(folder)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=_SCRATCH) as scratch:
-            built = _build(compiler, flags, source, Path(scratch))
-            loaded = ctypes.CDLL(str(built))
-            os.replace(built, library)
-            return loaded
-    except OSError as error:
-        logger.warning("The cache folder %s cannot be used (%s): compiling in each process.", folder, error)
-    try:
-        with tempfile.TemporaryDirectory(prefix="mpcoffline-") as scratch:
-            return ctypes.CDLL(str(_build(compiler, flags, source, Path(scratch))))
-    except OSError as error:
-        raise _failure(compiler, str(error)) from error
+        words = [given] if shutil.which(given) else shlex.split(given)
+    except ValueError:  # a quotation mark without its other
+        words = []
+    program = shutil.which(words[0]) if words else None
+    if program:
+        return [shlex.join([program, *words[1:]]), *(shlex.quote(path) for path in found)]
+    if found:
+        warn_once(f"CC={given!r} names no program on the PATH: {found[0]} is taken.")
+    return [shlex.quote(path) for path in found]
 
 
 def find_compiler() -> str:
-    """The C compiler: ``$CC``, else ``cc``, ``gcc`` or ``clang``.
+    """The first of :func:`compilers`.
 
     Raises:
         CompilerError: If there is none.
     """
-    candidates = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    for candidate in candidates:
-        path = shutil.which(candidate)
-        if path:
-            return path
+    for compiler in compilers():
+        return compiler
     raise CompilerError(
         "C compiler",
-        expected=f"one of {', '.join(candidates)} on the PATH",
+        expected="CC, or one of cc, gcc, clang on the PATH",
         actual="none",
-        hint="Install gcc or clang.",
+        hint="Install gcc or clang, or set CC to one.",
     )
+
+
+def flags_of(compiler: str) -> tuple[str, ...]:
+    """Those of :data:`FLAGS` that a compiler takes.
+
+    Raises:
+        CompilerError: If it does not answer.
+    """
+    return _target(compiler)[0]
+
+
+@functools.cache
+def trial(compiler: str) -> str:
+    """Why a compiler cannot compile solvers at all, in words; empty if it can."""
+    try:
+        flags, _ = _target(compiler)
+        with tempfile.TemporaryDirectory(prefix="mpcoffline-") as folder:
+            ctypes.CDLL(str(_output(compiler, flags, _TRIAL, Path(folder))))
+    except CompilerError as error:
+        return error.actual
+    except OSError as error:
+        return str(error)
+    return ""
+
+
+def _compiled_by(compiler: str, source: str) -> ctypes.CDLL:
+    """The library, by one compiler: from the cache, else built there, else, where there is no room, elsewhere."""
+    flags, target = _target(compiler)
+    key = hashlib.sha256("\0".join([source, *flags, target]).encode()).hexdigest()[:24]
+    name, failure = f"ddp-{key}.so", "no folder"
+    try:
+        for folder in cache_folders(_KIND):
+            try:
+                return _loaded(folder / name, name) or _built(compiler, flags, source, folder / name)
+            except OSError as error:
+                failure = str(error)
+                warn_once(f"The cache folder {folder} cannot be used ({failure}).")
+    except StorageError as error:
+        failure = str(error)
+    raise _failure(compiler, failure)
 
 
 @functools.cache
@@ -109,48 +167,116 @@ def _target(compiler: str) -> tuple[tuple[str, ...], str]:
 
     The target are its predefined macros: they name its version and every processor feature that it will use.
     """
-    macros = ("-dM", "-E", "-x", "c", os.devnull)
-    for flags in (FLAGS, tuple(flag for flag in FLAGS if flag != "-march=native")):
-        done = _run(compiler, *(flag for flag in flags if flag.startswith("-march")), *macros)
-        if not done.returncode:
-            return flags, compiler + "\n" + "\n".join(sorted(done.stdout.splitlines()))
-    raise _failure(compiler, done.stderr)
+
+    def macros(*flags: str) -> subprocess.CompletedProcess[str]:
+        return _run(compiler, *flags, "-dM", "-E", "-x", "c", os.devnull)
+
+    flags: tuple[str, ...] = FLAGS
+    done = macros(*flags)
+    if done.returncode:
+        flags = tuple(flag for flag in FLAGS if not macros(flag).returncode)
+        done = macros(*flags)
+    if done.returncode:
+        raise _failure(compiler, done.stderr)
+    return flags, compiler + "\n" + "\n".join(sorted(done.stdout.splitlines()))
 
 
-def _build(compiler: str, flags: tuple[str, ...], source: str, scratch: Path) -> Path:
-    """Compiles in a scratch folder and seals the result."""
-    code, built = scratch / "solver.c", scratch / "solver.so"
-    code.write_text(source, encoding="utf-8")
-    done = _run(compiler, *flags, str(code), "-o", str(built), "-lm")
-    if done.returncode or not built.exists():
-        raise _failure(compiler, done.stderr or "no output")
-    with built.open("r+b") as file:
-        digest = hashlib.sha256(file.read()).digest()
-        file.write(digest)  # after the end of the object, where no loader looks
-    return built
+def _built(compiler: str, flags: tuple[str, ...], source: str, library: Path) -> ctypes.CDLL:
+    """Compiles in a scratch folder, seals the result, loads it and puts it into the cache."""
+    with scratch_folder(library.parent) as scratch:
+        built = _output(compiler, flags, source, scratch)
+        built.chmod(0o700)
+        with built.open("r+b") as file:
+            file.write(_seal(file.read(), library.name))  # after the end of the object, where no loader looks
+        loaded = _loaded(built, library.name)
+        if loaded is None:
+            raise OSError(f"{built} is not what was written")
+        os.replace(built, library)
+    trim(keep=library)
+    return loaded
 
 
-def _is_sealed(library: Path) -> bool:
-    """Whether a library is as :func:`_build` left it; loading a truncated one would crash the process."""
-    content = library.read_bytes()
-    return hashlib.sha256(content[:-32]).digest() == content[-32:]
+def _output(compiler: str, flags: tuple[str, ...], source: str, scratch: Path) -> Path:
+    """What a compiler makes of a source that it reads from a pipe, in a folder that is its alone."""
+    built = scratch / "solver.so"
+    done = _run(compiler, *flags, "-x", "c", "-", "-o", str(built), "-lm", source=source, scratch=scratch)
+    if not done.returncode and built.exists():
+        return built
+    if not _has_room(scratch, done.stderr):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(scratch))
+    raise _failure(compiler, done.stderr or "no output")
 
 
-def _remove_abandoned(folder: Path) -> None:
-    """Removes what interrupted builds left behind more than an hour ago."""
-    for scratch in folder.glob(_SCRATCH + "*"):
-        with contextlib.suppress(OSError):
-            if time.time() - scratch.stat().st_mtime > 3600.0:
-                shutil.rmtree(scratch)
+def _has_room(folder: Path, stderr: str) -> bool:
+    """Whether a compiler failed for another reason than a full disk, a quota or a limit of files' sizes."""
+    if any(os.strerror(code) in stderr for code in _NO_ROOM):
+        return False
+    try:
+        with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
+            return file.write(bytes(_ENOUGH)) == _ENOUGH
+    except OSError:
+        return False
 
 
-def _run(compiler: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def _seal(content: bytes, name: str) -> bytes:
+    """The digest of a library and the name that it has in the cache."""
+    return hashlib.sha256(content + name.encode()).digest()
+
+
+def _loaded(library: Path, name: str) -> ctypes.CDLL | None:
+    """The library, if it is there and as :func:`_built` left it; loading a truncated one would crash the process.
+
+    Raises:
+        OSError: If the system does not load it.
+    """
+    try:
+        descriptor = open_own(library)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        logger.warning("A solver in the cache is not used, but built again: %s.", error)
+        return None
+    with os.fdopen(descriptor, "rb") as file:
+        content = file.read()
+        if content[-32:] != _seal(content[:-32], name):
+            logger.warning("Rebuilding the damaged solver %s.", library)
+            return None
+        mark_used(library)
+        return ctypes.CDLL(_name_of(descriptor) or str(library))
+
+
+def _name_of(descriptor: int) -> str:
+    """A path of the open file itself, which nobody can exchange; empty where the system has none.
+
+    The loader takes equal paths for the same library, and descriptors are used again. So each has its own turns in it,
+    the digits of a number: ``/`` and ``/.`` lead nowhere.
+    """
+    turns = "".join("/." if digit == "1" else "/" for digit in f"{next(_loads):b}")
+    path = f"/proc/self/fd{turns}/{descriptor}"
+    return path if os.path.exists(path) else ""
+
+
+def _run(
+    compiler: str, *arguments: str, source: str = "", scratch: Path | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Runs a compiler; its messages are English, its temporary files in the scratch folder."""
+    environment = os.environ | {"LC_ALL": "C"} | ({} if scratch is None else {"TMPDIR": str(scratch)})
     try:
         return subprocess.run(
-            [compiler, *arguments], capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False
+            [*shlex.split(compiler), *arguments],
+            input=source,
+            env=environment,
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=_TIMEOUT,
+            check=False,
         )
     except subprocess.TimeoutExpired as error:
         raise _failure(compiler, f"no result after {_TIMEOUT:.0f} s") from error
+    except BrokenPipeError as error:  # a program that reads nothing
+        raise _failure(compiler, "no output") from error
     except OSError as error:  # e.g. a file that is no program
         raise _failure(compiler, str(error)) from error
 
@@ -159,6 +285,6 @@ def _failure(compiler: str, message: str) -> CompilerError:
     return CompilerError(
         f"C compiler {compiler}",
         expected="a compiled solver",
-        actual=message.strip()[:500],
+        actual=message.strip()[:500] or "no message",
         hint="Set CC to another one.",
     )

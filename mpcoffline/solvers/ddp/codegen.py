@@ -10,10 +10,10 @@ import numpy as np
 
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.expressions import Instruction, expanded, instructions
+from mpcoffline.mpc.expressions import Instruction, expanded
 from mpcoffline.solvers.linear_quadratic import promises_convexity
 
-from .elimination import value_and_jacobian
+from .elimination import arithmetic, value_and_jacobian
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*"}
 _FORMATS = {
@@ -184,7 +184,7 @@ def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> 
         InvalidArgumentError: For an operation without a counterpart in C.
     """
     function = expanded(ca.Function(name, inputs, [output]))
-    program = list(instructions(function))
+    program = arithmetic(function)
     pointers = [f"i{k}" for k in range(len(inputs))]
     arguments = "".join(f"const vd *{pointer}, " for pointer in pointers) + "vd *out"
     if len(program) <= _LONGEST:

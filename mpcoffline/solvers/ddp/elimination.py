@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from heapq import heapify, heappop, heappush
 
 import casadi as ca
 
-from mpcoffline.mpc.expressions import expanded, instructions
+from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.mpc.expressions import Instruction, expanded, instructions
 
 # The derivatives of the commonest operations f(a, b); those of the others are CasADi's.
 _PARTIALS: dict[int, Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ...]]] = {
@@ -60,14 +62,24 @@ def value_and_jacobian(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[ca.SX
     the opposite one. Here the one with the fewest paths through it goes first (Markowitz' rule; Griewank and Walther,
     "Evaluating Derivatives", 2nd ed., ch. 9), which needs fewer operations than either: for a cart-pole's RK4
     step 430 multiplications by derivatives instead of 730 and 600.
+
+    Raises:
+        InvalidArgumentError: For an expression that calls functions, as :func:`arithmetic`.
     """
     graph, variables, results = _recorded(expression, z, theta)
     fixed = {*variables, *results}
     left = {k for k in range(len(graph.values)) if k not in fixed and graph.into[k]}
+    queue = [(graph.paths_through(k), k) for k in left]
+    heapify(queue)
     while left:
-        k = min(left, key=lambda k: (graph.paths_through(k), k))
+        paths, k = heappop(queue)
+        if k not in left or paths != graph.paths_through(k):  # overtaken by a later entry
+            continue
         left.remove(k)
+        neighbours = [n for n in (*graph.into[k], *graph.out_of[k]) if n in left]
         graph.eliminate(k)
+        for neighbour in neighbours:
+            heappush(queue, (graph.paths_through(neighbour), neighbour))
     jacobian = ca.SX(len(results), len(variables))
     for row, result in enumerate(results):
         for column, variable in enumerate(variables):
@@ -77,13 +89,17 @@ def value_and_jacobian(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[ca.SX
 
 
 def _recorded(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[_Graph, list[int], list[int]]:
-    """The graph of a column of expressions, and the numbers of z and of its results; constants of z have no edges."""
+    """The graph of a column of expressions, and the numbers of z and of its results; constants of z have no edges.
+
+    Raises:
+        InvalidArgumentError: For an expression that calls functions.
+    """
     function = expanded(ca.Function("f", [z, theta], [expression]))
     graph = _Graph()
     variables = [graph.add(z[i]) for i in range(z.numel())]
     varying, results = set(variables), {}
     number_at: dict[int, int] = {}  # by place in the work vector: the result that is there
-    for op, sources, targets, constant in instructions(function):
+    for op, sources, targets, constant in arithmetic(function):
         if op == ca.OP_CONST:
             number_at[targets[0]] = graph.add(ca.SX(constant))
         elif op == ca.OP_INPUT:
@@ -100,6 +116,23 @@ def _recorded(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[_Graph, list[i
             if any(operand in varying for operand in operands):
                 varying.add(k)
     return graph, variables, [results[i] for i in range(expression.numel())]
+
+
+def arithmetic(function: ca.Function) -> list[Instruction]:
+    """The instructions of an SX function that calls no other: such a call is no operation, and has no C.
+
+    Raises:
+        InvalidArgumentError: For one that does, e.g. an integrator or a table.
+    """
+    program = list(instructions(function))
+    if any(instruction.op == ca.OP_CALL for instruction in program):
+        raise InvalidArgumentError(
+            "mpc",
+            expected="functions of plain arithmetic for the ddp solver",
+            actual="a call of another function, such as an integrator or a table",
+            hint="Use ipopt.",
+        )
+    return program
 
 
 def _applied(graph: _Graph, op: int, operands: list[int], varying: set[int]) -> int:

@@ -99,7 +99,9 @@ class DDPSolver(Solver):
         n_starts: int | None = None,
         n_threads: int = 1,
     ) -> None:
-        super().__init__(mpc)
+        super().__init__(
+            mpc, max_iterations=max_iterations, tolerance=tolerance, n_starts=n_starts, n_threads=n_threads
+        )
         if mpc.constraints is not None:
             raise InvalidArgumentError(
                 "constraints",
