@@ -15,6 +15,8 @@ from mpcoffline.mpc import MPC
 
 Array = NDArray[np.float64]
 
+_FLOAT32 = float(np.finfo(np.float32).eps)
+
 
 class Plan(NamedTuple):
     """State and input trajectories, the warm start of the next solve; a row of NaN stands for "no warm start".
@@ -196,8 +198,10 @@ class Solver(ABC):
         if len(inputs) != n_problems:
             raise InvalidArgumentError("u0", expected=f"{n_problems} rows, as x", actual=f"{len(inputs)} rows")
         low, high = np.asarray(self.mpc.action_low), np.asarray(self.mpc.action_high)
-        slack = 1e-6 * np.where(np.isfinite(high - low), high - low, 0.0)  # float32 actions touch their bounds
-        if ((inputs < low - slack) | (inputs > high + slack)).any():
+        # float32 actions touch their bounds, which can be large against the range.
+        width = 1e-6 * np.where(np.isfinite(high - low), high - low, 0.0)
+        below, above = (width + _FLOAT32 * np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (low, high))
+        if ((inputs < low - below) | (inputs > high + above)).any():
             raise InvalidArgumentError("u0", expected=f"inputs from {low} to {high}", actual=str(inputs))
         return np.clip(inputs, low, high)
 

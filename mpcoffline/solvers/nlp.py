@@ -197,7 +197,7 @@ class _Program:
         first = np.broadcast_to(state, (1, self._mpc.nx))
         return [
             (np.concatenate([first, trajectories[i]]), inputs[i]) for i in order if np.isfinite(trajectories[i]).all()
-        ] or [(np.repeat(first, horizon + 1, axis=0), np.zeros((horizon, nu)))]
+        ] or [(np.repeat(first, horizon + 1, axis=0), inputs[0])]
 
     def _call(self, solver: ca.Function, p: Array, u0: Array | None, guess: tuple[Array, Array]) -> Found:
         """One run of ipopt, and the tests of what it returned."""
