@@ -70,7 +70,8 @@ class Solution:
             model, bounds and constraints, and the conditions of an optimum hold. ``(B,)``
         status: In words, one a problem: how it was solved, or what is wrong (e.g. the constraint that is violated).
         stats: Figures of the call: ``iterations`` ``(B,)``, ``time`` in s, and what the solver adds, e.g. the
-            ``residual`` ``(B,)`` of the conditions of an optimum.
+            ``residual`` ``(B,)`` of the conditions of an optimum, or ``all_starts``, whether problems that failed were
+            tried from all starts.
     """
 
     u0: Array
@@ -164,6 +165,24 @@ class Solver(ABC):
         """Q_theta(s, a) of (Q_th), ``(B,)`` or a scalar; +inf where no solution was found."""
         solution = self.solve(x, theta, u0=u)
         return np.where(solution.success, solution.value, np.inf)
+
+    @property
+    def constrained(self) -> bool:
+        """Whether plans can violate anything: there are constraints other than input bounds."""
+        return self.mpc.constraints is not None
+
+    def violation(self, x: Array, u: Array) -> Array:
+        """How much each plan violates a hard constraint or state bound, ``(B,)``.
+
+        Args:
+            x: Initial states, ``(B, nx)``.
+            u: Inputs, ``(B, N, nu)``.
+
+        Returns:
+            The largest violation of each; zero where it is within the tolerance of the solver, or nothing can be
+            violated, inf where the model run with these inputs is not finite.
+        """
+        return np.zeros(len(x))
 
     @abstractmethod
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
