@@ -186,7 +186,7 @@ _HEADER = """\
 @BOUNDS@
  *
  * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
- * one whose warm start led nowhere, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a quarter
+ * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a quarter
  * of them. An iteration costs the same each time, up to the 10 trial steps of its line search.
  */
 #ifndef MPC_CONTROLLER_H
@@ -223,8 +223,11 @@ typedef struct {
 /* Forgets the plan: call it before the first step and when an episode begins. */
 void mpc_reset(mpc_state *state);
 
-/* The action u for the observation y. Returns 0; or 1 if the problem was not solved, and u is the next input of the
- * plan before (zero without one, within bounds). */
+/* The action u for the observation y, always within its bounds. Returns where it comes from:
+ *   0  the problem was solved, from the plan of the step before or else from all starts;
+ *   1  it was not; the best plan that was found is applied: the model run with inputs within their bounds;
+ *   2  no plan was found that is finite: the next input of the plan before;
+ *   3  nor was there one before: zero, within the bounds. */
 int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NX], double u[MPC_NU]);
 
 #ifdef __cplusplus
@@ -253,7 +256,7 @@ int main(int argc, char **argv) {
         for (int i = 0; i < MPC_NX; ++i)
             if (fscanf(file, "%lf", &y[i]) != 1) return 2;
         if (reset) mpc_reset(&state);
-        unsolved += mpc_step(&mpc_learned_parameters, &state, y, u);
+        unsolved += mpc_step(&mpc_learned_parameters, &state, y, u) != 0;
         for (int a = 0; a < MPC_NU; ++a) {
             if (fscanf(file, "%lf", &expected) != 1) return 2;
             double error = fabs(u[a] - expected) / (1.0 + fabs(expected));

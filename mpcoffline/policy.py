@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-from dataclasses import dataclass
 from os import PathLike
 from typing import Any, Self, cast
 
@@ -19,35 +18,23 @@ from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_arc
 from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers import SOLVERS, Plan, Solution, Solver, make_solver
+from mpcoffline.solvers import SOLVERS, Plan, Solver, make_solver
+from mpcoffline.solvers.fallback import Fallback, SolverStats
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass
-class SolverStats:
-    """What the solves of a policy have amounted to.
-
-    Attributes:
-        n_solves: Problems solved.
-        n_failures: Problems whose solution was not accepted; the policy fell back to the previous plan.
-        iterations: Solver iterations in all.
-        time: Time in the solver in s.
-    """
-
-    n_solves: int = 0
-    n_failures: int = 0
-    iterations: int = 0
-    time: float = 0.0
 
 
 class MPCPolicy(BasePolicy):
     """The policy pi_theta(s) = u_0* of (MPC) with the interface of an SB3 policy.
 
     ``predict`` solves one MPC an observation. The warm start travels in SB3's recurrent ``state``, so that nothing is
-    hidden in the policy: ``state=None`` is a cold, deterministic solve. A solve that fails does not raise in the
-    control loop: the policy applies the next input of the previous plan (or zero, within bounds), counts it in
-    ``solver_stats``, and logs a warning the first time.
+    hidden in the policy: ``state=None`` is a cold, deterministic solve.
+
+    A solve that fails does not raise in the control loop. A problem that was only tried from its plan is solved again
+    from all starts; with ``rescue="ipopt"`` ipopt tries too; else the best plan found is applied, which is a rollout of
+    the model within the input bounds, or, if the previous plan violates hard constraints less or no plan is finite, the
+    next input of the previous one (zero, within bounds, if there is none either). ``solver_stats`` counts each of these
+    answers, and the first of each kind is logged.
 
     The policy is also a plain function, ``policy(observations)``: actions alone, by cold solves.
 
@@ -66,15 +53,19 @@ class MPCPolicy(BasePolicy):
         exploration_noise: sigma, a fraction of the action range; SB3's customary ``NormalActionNoise`` of 0.1 in
             actions scaled to [-1, 1] is 0.05 here.
         seed: Seeds the noise; :meth:`set_random_seed` starts it anew.
+        rescue: ``"ipopt"`` has ipopt try what the solver failed to solve, hundreds of times slower; its program is built
+            at the first failure. None, the default, for no rescue.
+        rescue_time: Time that ipopt may take for a problem, in s, the building aside.
         **solver_options: Passed to the solver.
 
     Attributes:
         mpc: The MPC.
-        solver_stats: Counts since construction.
+        solver_stats: Counts since construction, of solves and of how failures were answered.
 
     Raises:
-        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, or a negative noise or seed.
-        UnknownIdError: For an unknown solver.
+        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, or a negative noise or seed, or
+            a ``rescue_time`` that is not positive.
+        UnknownIdError: For an unknown solver or rescue.
     """
 
     def __init__(
@@ -86,12 +77,15 @@ class MPCPolicy(BasePolicy):
         action_space: spaces.Box | None = None,
         exploration_noise: float = 0.1,
         seed: int = 0,
+        rescue: str | None = None,
+        rescue_time: float = 1.0,
         **solver_options: Any,
     ) -> None:
         if observation_space is None:
             observation_space = spaces.Box(-np.inf, np.inf, (mpc.nx,), np.float32)
         if action_space is None:
-            low, high = (np.asarray(bound, dtype=np.float32) for bound in (mpc.action_low, mpc.action_high))
+            with np.errstate(over="ignore"):  # a bound beyond float32 is none
+                low, high = (np.asarray(bound, dtype=np.float32) for bound in (mpc.action_low, mpc.action_high))
             action_space = spaces.Box(low, high, dtype=np.float32)
         for name, space, size in (
             ("observation_space", observation_space, mpc.nx),
@@ -103,12 +97,17 @@ class MPCPolicy(BasePolicy):
             raise UnknownIdError.of("solver", solver, ["auto", *SOLVERS])
         super().__init__(observation_space, action_space)
         self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
-        self.solver_stats = SolverStats()
+        self._fallback = Fallback(mpc, rescue, rescue_time)
         self.exploration_noise = exploration_noise
         self.set_random_seed(seed)
         self._solver: Solver | None = None
         self._vec_normalize: VecNormalize | None = None
         self._clipping_reported = False
+
+    @property
+    def solver_stats(self) -> SolverStats:
+        """Counts since construction."""
+        return self._fallback.stats
 
     @property
     def exploration_noise(self) -> float:
@@ -198,7 +197,7 @@ class MPCPolicy(BasePolicy):
             observations = self._unnormalized(observations, self._vec_normalize)
         warm_start = self._warm_start(state, episode_start, len(observations))
         solution = self.solver.solve(observations, warm_start=warm_start)
-        inputs, plan = self._with_fallback(solution, warm_start)
+        inputs, plan = self._fallback.answer(self.solver, observations, warm_start, solution)
         if not deterministic:
             inputs = self._explored(inputs)
         space = self._action_box
@@ -296,25 +295,6 @@ class MPCPolicy(BasePolicy):
             return plan
         return plan.select(~np.broadcast_to(started, (n_problems,)))
 
-    def _with_fallback(self, solution: Solution, warm_start: Plan) -> tuple[NDArray[np.float64], Plan]:
-        """First inputs and the plan for the next step; where the solve failed, those of the plan before."""
-        stats, success = self.solver_stats, solution.success
-        stats.n_solves += len(success)
-        stats.iterations += int(solution.stats["iterations"].sum())
-        stats.time += float(solution.stats["time"])
-        if success.all():
-            return solution.u0, solution.plan.shifted()
-        if stats.n_failures == 0:
-            reasons = sorted({solution.status[i] for i in np.flatnonzero(~success)})
-            logger.warning("An MPC was not solved (%s): applying the previous plan.", ", ".join(reasons))
-        stats.n_failures += int((~success).sum())
-        zero = np.clip(0.0, np.asarray(self.mpc.action_low), np.asarray(self.mpc.action_high))
-        usable = warm_start.known[:, None]
-        previous = np.where(usable, np.nan_to_num(warm_start.u[:, 0]), zero)
-        chosen, next_plan, old_plan = success[:, None, None], solution.plan.shifted(), warm_start.shifted()
-        plan = Plan(np.where(chosen, next_plan.x, old_plan.x), np.where(chosen, next_plan.u, old_plan.u))
-        return np.where(success[:, None], solution.u0, previous), plan
-
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed."""
         observation_space = self.observation_space
@@ -325,6 +305,8 @@ class MPCPolicy(BasePolicy):
             "solver_options": self.solver_options,
             "exploration_noise": self.exploration_noise,
             "seed": self._seed,
+            "rescue": self._fallback.rescue,
+            "rescue_time": self._fallback.rescue_time,
             "observation_space": box_to_json(observation_space),
             "action_space": box_to_json(self._action_box),
         }
@@ -350,5 +332,7 @@ class MPCPolicy(BasePolicy):
                 action_space=box_from_json(document["action_space"]),
                 exploration_noise=document.get("exploration_noise", 0.1),
                 seed=document.get("seed", 0),
+                rescue=document.get("rescue"),
+                rescue_time=document.get("rescue_time", 1.0),
                 **document["solver_options"],
             )

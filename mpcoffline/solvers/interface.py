@@ -17,6 +17,8 @@ from mpcoffline.mpc import MPC
 
 Array = NDArray[np.float64]
 
+_FLOAT32 = float(np.finfo(np.float32).eps)
+
 
 class Plan(NamedTuple):
     """State and input trajectories, the warm start of the next solve; a row of NaN stands for "no warm start".
@@ -70,7 +72,8 @@ class Solution:
             model, bounds and constraints, and the conditions of an optimum hold. ``(B,)``
         status: In words, one a problem: how it was solved, or what is wrong (e.g. the constraint that is violated).
         stats: Figures of the call: ``iterations`` ``(B,)``, ``time`` in s, and what the solver adds, e.g. the
-            ``residual`` ``(B,)`` of the conditions of an optimum.
+            ``residual`` ``(B,)`` of the conditions of an optimum, or ``all_starts``, whether problems that failed were
+            tried from all starts.
     """
 
     u0: Array
@@ -207,6 +210,24 @@ class Solver(ABC):
         solution = self.solve(x, theta, u0=u)
         return np.where(solution.success, solution.value, np.inf)
 
+    @property
+    def constrained(self) -> bool:
+        """Whether plans can violate anything: there are constraints other than input bounds."""
+        return self.mpc.constraints is not None
+
+    def violation(self, x: Array, u: Array) -> Array:
+        """How much each plan violates a hard constraint or state bound, ``(B,)``.
+
+        Args:
+            x: Initial states, ``(B, nx)``.
+            u: Inputs, ``(B, N, nu)``.
+
+        Returns:
+            The largest violation of each; zero where it is within the tolerance of the solver, or nothing can be
+            violated, inf where the model run with these inputs is not finite.
+        """
+        return np.zeros(len(x))
+
     @abstractmethod
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         """Solves the batch; arguments are checked, ``x`` is ``(B, nx)``, theta ``(size,)`` or has B rows.
@@ -240,8 +261,10 @@ class Solver(ABC):
         if len(inputs) != n_problems:
             raise InvalidArgumentError("u0", expected=f"{n_problems} rows, as x", actual=f"{len(inputs)} rows")
         low, high = np.asarray(self.mpc.action_low), np.asarray(self.mpc.action_high)
-        slack = 1e-6 * np.where(np.isfinite(high - low), high - low, 0.0)  # float32 actions touch their bounds
-        if ((inputs < low - slack) | (inputs > high + slack)).any():
+        # float32 actions touch their bounds, which can be large against the range.
+        width = 1e-6 * np.where(np.isfinite(high - low), high - low, 0.0)
+        below, above = (width + _FLOAT32 * np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (low, high))
+        if ((inputs < low - below) | (inputs > high + above)).any():
             raise InvalidArgumentError("u0", expected=f"inputs from {low} to {high}", actual=str(inputs))
         return np.clip(inputs, low, high)
 

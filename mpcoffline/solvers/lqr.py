@@ -80,7 +80,7 @@ class LQRSolver(Solver):
                 solution = self._solve_with(theta, x, u0, warm_start)
             else:
                 solution = self._solve_each(theta, x, u0, warm_start)
-        solution.stats["time"] = time.perf_counter() - start
+        solution.stats.update(time=time.perf_counter() - start, all_starts=True)
         return solution
 
     def _solve_each(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan | None) -> Solution:

@@ -42,6 +42,8 @@ class IpoptSolver(Solver):
         n_starts: Starting points of a cold solve; by default 4, and 1 where the problem is convex.
         tolerance: ipopt's relative convergence tolerance.
         max_iterations: Bound on the iterations of each ipopt call.
+        max_time: Bound on the time of a problem in s, shared out among its calls of ipopt, of which there are up to two
+            more than starts. What it cuts short is not accepted, but returned.
         n_workers: Processes that share a batch (CasADi's threads crash with ipopt). They start with the first batch,
             which takes seconds, and end with the solver; results do not depend on their number.
     """
@@ -56,6 +58,7 @@ class IpoptSolver(Solver):
         n_starts: int | None = None,
         tolerance: float = 1e-8,
         max_iterations: int = 300,
+        max_time: float = np.inf,
         n_workers: int = 1,
     ) -> None:
         super().__init__(
@@ -64,11 +67,14 @@ class IpoptSolver(Solver):
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
         check_integers(1, max_iterations=max_iterations, n_workers=n_workers)
+        if not max_time > 0.0:
+            raise InvalidArgumentError("max_time", expected="a positive number of seconds", actual=str(max_time))
         self._n_starts = n_starts or (1 if is_convex(mpc) else 4)
         self._options: dict[str, Any] = {
             "n_starts": self._n_starts,
             "tolerance": tolerance,
             "max_iterations": max_iterations,
+            "max_time": max_time,
         }
         self._candidates = candidate_inputs(mpc)
         self._alone = OneAtATime()
@@ -100,6 +106,7 @@ class IpoptSolver(Solver):
             "time": time.perf_counter() - start,
             "residual": np.array([one.residual for one in found]),
             "violation": np.array([one.violation for one in found]),
+            "all_starts": True,
         }
         success, values = np.array([one.success for one in found]), np.array([one.value for one in found])
         trajectories = np.stack([one.x for one in found])
@@ -118,6 +125,10 @@ class IpoptSolver(Solver):
             )
             for i, state in enumerate(x)
         ]
+
+    def violation(self, x: Array, u: Array) -> Array:
+        """See :meth:`Solver.violation`."""
+        return np.array([self._common.excess(*one, self._theta) for one in zip(x, u, strict=True)])
 
     def close(self) -> None:
         """Ends the worker processes, if there are any; a later batch starts them again."""
@@ -162,11 +173,14 @@ class _Program:
         n_starts: int,
         tolerance: float,
         max_iterations: int,
+        max_time: float,
         stagewise: bool = False,
     ) -> None:
         self._mpc, self._candidates, self._n_starts = mpc, candidates, n_starts
         self._problem = Transcription(mpc, stagewise)
         common = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
+        if np.isfinite(max_time):
+            common["max_wall_time"] = max_time / (n_starts + 2)
         warm = {"warm_start_init_point": "yes", "mu_init": 1e-4}
         self._cold = _ipopt("cold", self._problem, common, {"hess_lag": _cost_curvature(self._problem)})
         self._exact = _ipopt("exact", self._problem, common | warm, {})
@@ -188,6 +202,15 @@ class _Program:
             best = polished
         return replace(best, iterations=iterations)
 
+    def excess(self, state: Array, u: Array, theta: Array) -> float:
+        """By how much a plan violates a hard constraint; zero within the tolerance, inf if it is not finite."""
+        p = np.r_[state, theta.ravel()]
+        x = np.vstack([state, self._problem.simulate(u.T, p).full().T])
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            return np.inf
+        violation, _ = self._problem.violation(self._problem.pack(x, u, p), p)
+        return 0.0 if violation <= _tolerated(x) else violation
+
     def _starts(self, state: Array, theta: Array, u0: Array | None) -> list[tuple[Array, Array]]:
         """The ``n_starts`` cheapest of the candidate input sequences, with the states that they lead to."""
         inputs = self._candidates.copy()
@@ -202,7 +225,7 @@ class _Program:
         first = np.broadcast_to(state, (1, self._mpc.nx))
         return [
             (np.concatenate([first, trajectories[i]]), inputs[i]) for i in order if np.isfinite(trajectories[i]).all()
-        ] or [(np.repeat(first, horizon + 1, axis=0), np.zeros((horizon, nu)))]
+        ] or [(np.repeat(first, horizon + 1, axis=0), inputs[0])]
 
     def _call(self, solver: ca.Function, p: Array, u0: Array | None, guess: tuple[Array, Array]) -> Found:
         """One run of ipopt, and the tests of what it returned."""
@@ -223,10 +246,9 @@ class _Program:
         multipliers = Multipliers(result["lam_x"].full().ravel(), result["lam_g"].full().ravel())
         residual = problem.optimality(point, p, u0, multipliers)
         status = str(stats["return_status"])
-        scale = 1.0 + float(np.abs(x).max())
         if not (followed and np.isfinite(value)):
             failure = "the model run with the inputs found is not finite"
-        elif not violation <= _FEASIBILITY_TOLERANCE * scale:
+        elif not violation <= _tolerated(x):
             failure = f"{where} is violated by {violation:.3g}"
         elif not residual <= _OPTIMALITY_TOLERANCE:
             failure = f"not optimal, the first-order conditions leave {residual:.1e}"
@@ -234,6 +256,11 @@ class _Program:
             failure = ""
         words = f"{status}: {failure}" if failure else status
         return Found(x, u, value, not failure, words, int(stats["iter_count"]), residual, violation)
+
+
+def _tolerated(x: Array) -> float:
+    """The violation of a constraint that still counts as none."""
+    return _FEASIBILITY_TOLERANCE * (1.0 + float(np.abs(x).max()))
 
 
 def _cost_curvature(problem: Transcription) -> ca.Function:

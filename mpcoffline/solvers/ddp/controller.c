@@ -1,5 +1,12 @@
 /* The controller: one problem, warm from the plan of the step before, cold from the best of many input sequences. */
 
+static int is_finite(const lanes *w) {
+    double zero = w->J - w->J; /* NaN as soon as something is not finite */
+    for (int i = 0; i < MPC_HORIZON * NU; ++i) zero += w->u[i] - w->u[i];
+    for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) zero += w->x[i] - w->x[i];
+    return zero == 0.0;
+}
+
 /* Iterates from w->x, w->u; J = INFINITY says that w->x need not obey the model. Returns one of the states above. */
 static int solve(const mpc_problem *m, lanes *w) {
     w->mu = w->alpha = 0.0;
@@ -8,19 +15,16 @@ static int solve(const mpc_problem *m, lanes *w) {
         iterate(m, w, -1, &converged, &moved, &stalled);
         if (k == m->max_iterations && !stalled) converged |= acceptable(m, w);
         if (!converged && !stalled) continue;
-        double zero = w->J - w->J; /* NaN as soon as something is not finite */
-        for (int i = 0; i < MPC_HORIZON * NU; ++i) zero += w->u[i] - w->u[i];
-        for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) zero += w->x[i] - w->x[i];
-        return zero != 0.0 ? NOT_FINITE : converged ? CONVERGED : STALLED;
+        return !is_finite(w) ? NOT_FINITE : converged ? CONVERGED : STALLED;
     }
-    return w->J < INFINITY && w->J > -INFINITY ? ITERATION_LIMIT : NOT_FINITE;
+    return is_finite(w) ? ITERATION_LIMIT : NOT_FINITE;
 }
 
 static double candidate(int c, int k, int a) { return candidates[(c * SEGMENTS + k / SEGMENT) * NU + a]; }
 
-static void keep(mpc_state *state, const lanes *w) {
-    for (int i = 0; i < MPC_HORIZON * NU; ++i) state->u[i] = w->u[i];
-    for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->x[i] = w->x[i];
+static void keep(double *x, double *u, const double *from_x, const double *from_u) {
+    for (int i = 0; i < MPC_HORIZON * NU; ++i) u[i] = from_u[i];
+    for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) x[i] = from_x[i];
 }
 
 /* From one of the candidates, for a few iterations. */
@@ -35,11 +39,11 @@ static void start(const mpc_problem *m, lanes *w, int c) {
 }
 
 /* Solves from MPC_STARTS starts, each the cheapest of its share of the candidates: a few iterations each, the best go
- * on (they are run again, which needs less memory than keeping all), the best solution is kept. Returns whether there
- * is one. */
+ * on (they are run again, which needs less memory than keeping all), the best plan is kept, and its cost is w->J. Returns
+ * its state; NOT_FINITE if there is none. */
 static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     double J[N_CANDIDATES], raced[MPC_STARTS], best = INFINITY;
-    int cheapest[MPC_STARTS], best_converged = 0;
+    int cheapest[MPC_STARTS], best_status = NOT_FINITE;
     int64_t chosen[FINALISTS(MPC_STARTS)];
     for (int c = 0; c < N_CANDIDATES; ++c) {
         for (int k = 0; k < MPC_HORIZON; ++k)
@@ -57,26 +61,49 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     choose_finalists(raced, MPC_STARTS, chosen);
     for (int l = 0; l < FINALISTS(MPC_STARTS); ++l) {
         start(m, w, cheapest[chosen[l]]);
-        int converged = solve(m, w) == CONVERGED;
+        int status = solve(m, w), converged = status == CONVERGED, best_converged = best_status == CONVERGED;
+        if (status == NOT_FINITE) continue;
         /* A converged solution that is as good as the best goes before one that is not. */
         double slack = BEATEN * (1.0 + fabs(best));
         int closer = converged && !best_converged && w->J < best + slack;
         if (closer || w->J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY)) {
             best = w->J;
-            best_converged = converged;
-            keep(state, w);
+            best_status = status;
+            keep(state->x, state->u, w->x, w->u);
         }
     }
-    return best_converged;
+    w->J = best;
+    return best_status;
 }
 
 void mpc_reset(mpc_state *state) { state->has_plan = 0; }
+
+/* From the plan of the step before; where that is not solved, from all starts. The plan of the state becomes the solution,
+ * else the better of the two plans found, else it stays the one before. Returns what mpc_step does. */
+static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
+    for (int i = 0; i < MPC_HORIZON * NU; ++i) w->u[i] = clip(state->u[i], low[i % NU], high[i % NU]);
+    for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w->x[i] = i < NX ? w->s[i] : state->x[i];
+    w->J = INFINITY;
+    int status = solve(m, w), found = status != NOT_FINITE;
+    double J = found ? w->J : INFINITY;
+    if (status == CONVERGED) {
+        keep(state->x, state->u, w->x, w->u);
+        return 0;
+    }
+    if (found) keep(state->old_x, state->old_u, w->x, w->u);
+    else keep(state->old_x, state->old_u, state->x, state->u);
+    status = solve_cold(m, state, w);
+    if (status == CONVERGED) return 0;
+    if (status != NOT_FINITE && w->J < J) return 1;
+    keep(state->x, state->u, state->old_x, state->old_u);
+    return found ? 1 : 2;
+}
 
 int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NX], double u[MPC_NU]) {
     const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, MPC_MAX_ITERATIONS, TOLERANCE};
     const double *theta = (const double *)parameters;
     lanes w;
-    int solved = 0;
+    int answer;
     w.x = state->work_x, w.u = state->work_u, w.x_new = state->work_x_new, w.u_new = state->work_u_new;
     w.k = state->work_k, w.K = state->work_K;
     for (int i = 0; i < NP; ++i) w.p[i] = theta[i];
@@ -84,26 +111,16 @@ int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[
     for (int i = 0; i < NX; ++i) w.s[i] = y[i];
     for (int a = 0; a < NU; ++a) w.low0[a] = low[a], w.high0[a] = high[a];
     if (state->has_plan) {
-        for (int i = 0; i < MPC_HORIZON * NU; ++i) w.u[i] = clip(state->u[i], low[i % NU], high[i % NU]);
-        for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w.x[i] = i < NX ? y[i] : state->x[i];
-        w.J = INFINITY;
-        int status = solve(&problem, &w);
-        solved = status == CONVERGED;
-        if (solved) keep(state, &w);
-        if (status == STALLED || status == NOT_FINITE) { /* the plan led nowhere; it is kept if a cold start does too */
-            for (int i = 0; i < MPC_HORIZON * NU; ++i) state->old_u[i] = state->u[i];
-            for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) state->old_x[i] = state->x[i];
-            solved = solve_cold(&problem, state, &w);
-            for (int i = 0; i < MPC_HORIZON * NU && !solved; ++i) state->u[i] = state->old_u[i];
-            for (int i = 0; i < (MPC_HORIZON + 1) * NX && !solved; ++i) state->x[i] = state->old_x[i];
-        }
+        answer = improve(&problem, state, &w);
     } else {
-        solved = state->has_plan = solve_cold(&problem, state, &w);
-        for (int a = 0; a < NU && !solved; ++a) state->u[a] = 0.0;
+        int status = solve_cold(&problem, state, &w);
+        answer = status == CONVERGED ? 0 : status == NOT_FINITE ? 3 : 1;
+        state->has_plan = answer < 3;
+        for (int a = 0; a < NU && answer == 3; ++a) state->u[a] = 0.0;
     }
     for (int a = 0; a < NU; ++a) u[a] = clip(state->u[a], low[a], high[a]);
     /* The plan of the next step, its last input held. */
     for (int i = 0; i < (MPC_HORIZON - 1) * NU; ++i) state->u[i] = state->u[i + NU];
     for (int i = 0; i < MPC_HORIZON * NX; ++i) state->x[i] = state->x[i + NX];
-    return solved ? 0 : 1;
+    return answer;
 }

@@ -90,7 +90,8 @@ static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
         for (int i = 0; i < NX; ++i) dx[i] = x[k * NX + i] - w->x[k * NX + i];
         for (int a = 0; a < NU; ++a) {
             vd v = w->u[k * NU + a] + alpha * w->k[k * NU + a];
-            for (int i = 0; i < NX; ++i) v += K[i * NU + a] * dx[i];
+            /* No feedback at k = 0, where dx = 0: a derivative that is singular at s alone gives a K that is NaN. */
+            for (int i = 0; i < NX && k; ++i) v += K[i * NU + a] * dx[i];
             u[a] = clip(v, k ? V(m->low[a]) : w->low0[a], k ? V(m->high[a]) : w->high0[a]);
         }
         gen_step(x + k * NX, u, w->p, out);

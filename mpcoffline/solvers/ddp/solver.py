@@ -135,6 +135,7 @@ class DDPSolver(Solver):
         status = result["status"]
         stats: dict[str, Any] = {"iterations": result["iterations"], "time": time.perf_counter() - start}
         stats["predicted_decrease"] = result["predicted"]
+        stats["all_starts"] = result.get("all_starts", warm_start is None)
         words = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
         return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], status == 0, words, stats)
 
@@ -145,11 +146,18 @@ class DDPSolver(Solver):
         if n_known == 0:
             return self._run(x, theta, u0, None)
         result = self._run(x, theta, u0, plan) if n_known == len(x) else self._run_mixed(x, theta, u0, plan, known)
+        if not np.count_nonzero(result["status"]):
+            return result
         lost = known & (result["status"] > 1)
+        result["all_starts"] = ~known | lost
         if np.count_nonzero(lost):
             again = self._run(x[lost], _rows(theta, lost), None if u0 is None else u0[lost], None)
+            # A plan that is not accepted either is only taken if it is better.
+            rows = np.flatnonzero(lost)
+            taken = (again["status"] == 0) | ~(again["J"] >= result["J"][rows])
+            result["iterations"][rows] += again.pop("iterations")
             for name, array in again.items():
-                result[name][lost] = array
+                result[name][rows[taken]] = array[taken]
         return result
 
     def _run_mixed(
