@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.mpc import MPC
-from mpcoffline.parallel import Workers
+from mpcoffline.parallel import Workers, n_cpus
 
 from .interface import Array, Plan
 
@@ -33,7 +33,7 @@ class WorkerPool:
     Args:
         mpc: The problem.
         options: Of the solver.
-        n_workers: Number of processes.
+        n_workers: Number of processes, at most; there are never more than processors or problems.
 
     Raises:
         InvalidArgumentError: For an MPC that cannot be written to JSON, which is how it travels.
@@ -49,6 +49,7 @@ class WorkerPool:
             ) from error
         self._task, self._n_workers = _Task(document, dict(options)), n_workers
         self._workers: Workers[_Part, list[Found]] | None = None
+        self._n_started = 0
 
     def solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
         """The solutions in the order of the problems."""
@@ -64,8 +65,10 @@ class WorkerPool:
             )
             for low, high in pairwise(edges)
         }
-        if self._workers is None:
-            self._workers = Workers(self._task, self._n_workers)
+        wanted = min(self._n_workers, n, n_cpus())
+        if self._workers is None or wanted > self._n_started:
+            self.close()
+            self._workers, self._n_started = Workers(self._task, wanted), wanted
         try:
             found = dict(self._workers.run(jobs))
         except BaseException:  # Ctrl-C, a worker that died: no process stays behind, the next batch starts new ones
@@ -77,7 +80,7 @@ class WorkerPool:
         """Ends the processes."""
         if self._workers is not None:
             self._workers.close()
-            self._workers = None
+            self._workers, self._n_started = None, 0
 
 
 class _Task:
