@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import io
-import json
 import lzma
 import math
 import os
 import struct
 import tokenize
-import uuid
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mpcoffline.errors import FileFormatError, MPCOfflineError, StorageError
+from mpcoffline.core import limits
+from mpcoffline.core.documents import parsed_json, written_json
+from mpcoffline.core.files import check_regular
+from mpcoffline.core.limits import check_limit
+from mpcoffline.core.outputs import replaced
+from mpcoffline.errors import FileFormatError, MPCOfflineError
 
 _VERSION = 1
 _DOCUMENT, _ARRAYS = "mpcoffline.json", "arrays.npz"
+_END = struct.Struct("<4s4H2LH")  # the last record of a zip: 22 bytes, and a comment, of which we write none
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal contents give equal bytes
 
 # What zipfile, zlib, json and numpy raise on damaged bytes; OSError and ValueError include their own classes.
@@ -52,33 +56,25 @@ _MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError,
 def write_archive(
     path: str | PathLike[str], kind: str, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
 ) -> None:
-    """Writes an archive; an existing file is replaced only once the new one is complete.
+    """Writes an archive; an existing file is replaced only once the new one is complete and on the disk.
 
     Args:
-        path: Where to.
+        path: Where to. What a symbolic link points to is replaced, the link stays.
         kind: What it holds, checked by :func:`read_archive`.
         document: JSON-able content.
         arrays: Numpy arrays by name.
 
     Raises:
-        StorageError: If the disk or the file system refuses, as for a folder that does not exist.
+        StorageError: If the disk or the file system refuses, as for a folder that does not exist, or if what is there
+            is no regular file.
+        FileFormatError: If it is too large to be read again.
     """
-    target = Path(path).resolve()
     buffer = io.BytesIO()
     np.savez(buffer, **dict(arrays or {}))  # type: ignore[arg-type]
-    text = json.dumps({"format": "mpcoffline", "version": _VERSION, "kind": kind} | dict(document), indent=1)
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}")
-    try:
-        with temporary.open("xb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr(zipfile.ZipInfo(_DOCUMENT, _EPOCH), text, zipfile.ZIP_DEFLATED)
-            archive.writestr(zipfile.ZipInfo(_ARRAYS, _EPOCH), buffer.getvalue(), zipfile.ZIP_DEFLATED)
-        os.replace(temporary, target)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):  # which names the temporary file
-            raise StorageError.of(path, OSError(error.strerror or str(error))) from error
-        raise
+    text = written_json({"format": "mpcoffline", "version": _VERSION, "kind": kind} | dict(document), str(path))
+    with replaced(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(zipfile.ZipInfo(_DOCUMENT, _EPOCH), text, zipfile.ZIP_DEFLATED)
+        archive.writestr(zipfile.ZipInfo(_ARRAYS, _EPOCH), buffer.getvalue(), zipfile.ZIP_DEFLATED)
 
 
 def read_archive(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -93,28 +89,89 @@ def read_archive(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], 
 
     Raises:
         FileNotFoundError: If there is no such file.
-        FileFormatError: If it is damaged, foreign, of another kind or of a newer version.
+        FileFormatError: If it is damaged, foreign, of another kind or of a newer version, or holds more than
+            :mod:`mpcoffline.core.limits` allow.
     """
+    name = str(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            document = json.loads(archive.read(_DOCUMENT))
-            with np.load(io.BytesIO(archive.read(_ARRAYS)), allow_pickle=False) as stored:
-                arrays = {name: np.asarray(stored[name]) for name in stored.files}
-    except FileNotFoundError:
+        check_regular(Path(path))
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            size = file.seek(0, io.SEEK_END)
+            check_limit(name, "bytes", size, limits.ARCHIVE_BYTES)
+            with _opened(file) as archive:
+                members = _members(archive, {_DOCUMENT, _ARRAYS})
+                document = parsed_json(_content(archive, members[_DOCUMENT], limits.JSON_BYTES, name), name)
+                most = max(limits.ARRAY_BYTES, limits.ARRAY_RATIO * size)
+                arrays = _arrays(_content(archive, members[_ARRAYS], most, name))
+    except (FileNotFoundError, FileFormatError):
         raise
     except _DAMAGE as error:
-        raise FileFormatError(str(path), expected=f"an mpcoffline {kind} file", actual=f"{error!r}") from error
+        raise FileFormatError(name, expected=f"an mpcoffline {kind} file", actual=f"{error!r}"[:500]) from error
     found = (document.get("format"), document.get("kind")) if isinstance(document, dict) else (None, None)
     if found != ("mpcoffline", kind):
-        raise FileFormatError(str(path), expected=f"an mpcoffline {kind} file", actual=f"format and kind {found}")
-    if document.get("version") != _VERSION:
+        raise FileFormatError(name, expected=f"an mpcoffline {kind} file", actual=f"format and kind {found}"[:500])
+    version = document.get("version")
+    if type(version) is not int or version != _VERSION:  # True is equal to 1
         raise FileFormatError(
-            str(path),
+            name,
             expected=f"file version {_VERSION}",
-            actual=str(document.get("version")),
+            actual=repr(version)[:100],
             hint="Use the version of mpcoffline that wrote it.",
         )
     return document, arrays
+
+
+def _opened(file: IO[bytes]) -> zipfile.ZipFile:
+    """A zip of few members, with nothing behind its end; zipfile alone reads a list of members of any length."""
+    file.seek(0, io.SEEK_END)
+    file.seek(max(0, file.tell() - _END.size - 20))
+    tail = file.read()
+    signature, *_, bytes_of_list, _, comment = _END.unpack(tail[-_END.size :])
+    if signature != b"PK\5\6" or comment or bytes_of_list > limits.DIRECTORY_BYTES or tail.startswith(b"PK\6\7"):
+        raise zipfile.BadZipFile("not the end of a zip as mpcoffline writes it")
+    file.seek(0)
+    return zipfile.ZipFile(file)
+
+
+def _members(archive: zipfile.ZipFile, expected: set[str] | None = None) -> dict[str, zipfile.ZipInfo]:
+    """The members by name, each once."""
+    members = {member.filename: member for member in archive.infolist()}
+    if len(members) < len(archive.infolist()):
+        raise zipfile.BadZipFile("two members of one name")
+    if expected is not None and members.keys() != expected:
+        raise zipfile.BadZipFile(f"members {sorted(members)[:5]} instead of {sorted(expected)}")
+    return members
+
+
+def _content(archive: zipfile.ZipFile, member: zipfile.ZipInfo, most: int, name: str) -> bytes:
+    """What a member holds, read no further than to the limit."""
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others ask for memory themselves
+        raise zipfile.BadZipFile(f"{member.filename}: compression {member.compress_type}")
+    check_limit(f"{name}: {member.filename}", "bytes", member.file_size, most)
+    with archive.open(member) as stream:
+        return stream.read()  # which ends at file_size
+
+
+def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz that is not compressed again, each as large as its header says."""
+    found: dict[str, NDArray[Any]] = {}
+    with _opened(io.BytesIO(content)) as archive:
+        members = _members(archive)
+        check_limit(_ARRAYS, "arrays", len(members), limits.ARRAYS)
+        for name, member in members.items():
+            if not name.endswith(".npy") or member.compress_type != zipfile.ZIP_STORED:
+                raise zipfile.BadZipFile(f"{name}: no array as numpy.savez stores it")
+            with archive.open(member) as stream:
+                version = np.lib.format.read_magic(stream)
+                if version != (1, 0):
+                    raise ValueError(f"{name}: an array of format {version}")
+                shape, by_columns, dtype = np.lib.format.read_array_header_1_0(stream)
+                data = bytearray(stream.read())  # writable
+            if dtype.kind not in "biuf" or min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
+                raise ValueError(f"{name}: {len(data)} bytes for shape {shape} of {dtype}")
+            array = np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
+            found[name.removesuffix(".npy")] = array
+    return found
 
 
 def holds(path: str | PathLike[str], kind: str) -> bool:
@@ -140,7 +197,7 @@ def file_errors(path: str | PathLike[str]) -> Iterator[None]:
     try:
         yield
     except (*_MISFITS, MPCOfflineError) as error:
-        raise FileFormatError(str(path), expected="a complete mpcoffline file", actual=f"{error!r}") from error
+        raise FileFormatError(str(path), expected="a complete mpcoffline file", actual=f"{error!r}"[:1000]) from error
 
 
 def plain(value: Any) -> Any:

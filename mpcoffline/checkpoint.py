@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from mpcoffline.archive import file_errors, read_archive, write_archive
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.outputs import check_output
+from mpcoffline.core.text import check_name
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.fitting import Fit
 
 History = list[tuple[int, dict[str, float]]]
@@ -18,9 +21,13 @@ class Checkpoint:
     Args:
         path: Where.
         identity: What decides the fit (data, MPC, configuration, seed), as one short text.
+
+    Raises:
+        StorageError: If nothing could be written there.
     """
 
     def __init__(self, path: str | PathLike[str], identity: str) -> None:
+        check_output(path)
         self._path, self._identity = Path(path), identity
 
     def resume(self, fit: Fit) -> History:
@@ -35,7 +42,7 @@ class Checkpoint:
         document, arrays = read_archive(self._path, "checkpoint")
         with file_errors(self._path):
             identity = str(document["identity"])
-            history = [(int(epoch), dict(metrics)) for epoch, metrics in document["history"]]
+            history = history_from_json(document["history"])
         if identity != self._identity:
             raise InvalidArgumentError(
                 "checkpoint",
@@ -49,3 +56,18 @@ class Checkpoint:
     def write(self, fit: Fit, history: History) -> None:
         """Replaces the file; an interruption leaves the old one."""
         write_archive(self._path, "checkpoint", {"identity": self._identity, "history": history}, fit.to_arrays())
+
+
+def history_from_json(data: Any) -> History:
+    """A history as files hold it: ``[[epoch, {metric: number}], ...]``.
+
+    Raises:
+        FileFormatError: For something else.
+        TypeError: Likewise.
+        ValueError: Likewise.
+    """
+    history: History = []
+    for epoch, metrics in data:
+        numbers = {check_name("metric", name, error=FileFormatError): float(value) for name, value in metrics.items()}
+        history.append((int(epoch), numbers))
+    return history

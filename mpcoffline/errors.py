@@ -8,6 +8,19 @@ import os
 from collections.abc import Iterable
 
 
+def visible(text: str) -> str:
+    """Text for a terminal: what would steer it (escape sequences, marks that reorder a line) is shown as ``\\x1b``.
+
+    Line ends stay.
+
+    Args:
+        text: Any text, as one of a file.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c == "\n" or c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class MPCOfflineError(Exception):
     """Base class of the errors raised on purpose by mpcoffline.
 
@@ -21,7 +34,7 @@ class MPCOfflineError(Exception):
     def __init__(self, name: str, *, expected: str, actual: str, hint: str = "") -> None:
         self.name, self.expected, self.actual, self.hint = name, expected, actual, hint
         message = f"{name}: expected {expected}, got {actual}."
-        super().__init__(f"{message} {hint}".rstrip())
+        super().__init__(visible(f"{message} {hint}".rstrip()))  # parts of it may come from a file
 
 
 class InvalidArgumentError(MPCOfflineError, ValueError):

@@ -11,8 +11,9 @@ import numpy as np
 from gymnasium import spaces
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, holds, read_archive, write_archive
-from mpcoffline.checkpoint import Checkpoint, History
+from mpcoffline.checkpoint import Checkpoint, History, history_from_json
 from mpcoffline.checks import check_integers
+from mpcoffline.core.text import check_name
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.fitting import Epoch, Fit
@@ -169,6 +170,8 @@ class OfflineMPCLearner:
         show_progress: bool = True,
     ) -> Iterator[tuple[int, dict[str, float]]]:
         """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
+        for name in evaluators or {}:
+            check_name("evaluator", name)
         lengths: dict[str, int] = {}
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
@@ -273,7 +276,7 @@ class OfflineMPCLearner:
             nominal = MPC.from_json(document["nominal"])
             learner = cls(nominal, document["learn"], document["preset"], document["seed"], device=document["device"])
             learner.config = LearnerConfig.from_json(document["config"])
-            learner.history = [(int(epoch), dict(metrics)) for epoch, metrics in document["history"]]
+            learner.history = history_from_json(document["history"])
             if document["learned"] is not None:
                 learner._mpc = MPC.from_json(document["learned"])
             if document["result"] is not None:

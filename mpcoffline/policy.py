@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
-from mpcoffline.checks import check_integers
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.archive import box_from_json, box_to_json, file_errors, plain, read_archive, write_archive
+from mpcoffline.checks import check_integers, check_number
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers import SOLVERS, Plan, Solver, make_solver
+from mpcoffline.solvers import Plan, Solver, check_solver, make_solver
 from mpcoffline.solvers.fallback import Fallback, SolverStats
+from mpcoffline.solvers.options import OF_THE_MACHINE
 
 logger = logging.getLogger(__name__)
 
@@ -63,8 +64,8 @@ class MPCPolicy(BasePolicy):
         solver_stats: Counts since construction, of solves and of how failures were answered.
 
     Raises:
-        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, or a negative noise or seed, or
-            a ``rescue_time`` that is not positive.
+        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, a negative noise or seed, a
+            ``rescue_time`` that is not positive, or an option that the solver has not.
         UnknownIdError: For an unknown solver or rescue.
     """
 
@@ -93,8 +94,7 @@ class MPCPolicy(BasePolicy):
         ):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
                 raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
-        if solver != "auto" and solver not in SOLVERS:
-            raise UnknownIdError.of("solver", solver, ["auto", *SOLVERS])
+        check_solver(solver, solver_options)
         super().__init__(observation_space, action_space)
         self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
         self._fallback = Fallback(mpc, rescue, rescue_time)
@@ -120,8 +120,7 @@ class MPCPolicy(BasePolicy):
 
     @exploration_noise.setter
     def exploration_noise(self, value: float) -> None:
-        if not 0.0 <= value < np.inf:
-            raise InvalidArgumentError("exploration_noise", expected="a finite number >= 0", actual=str(value))
+        check_number("exploration_noise", value, 0.0, open_low=False)
         self._exploration_noise = float(value)
 
     def set_random_seed(self, seed: int) -> None:
@@ -296,13 +295,17 @@ class MPCPolicy(BasePolicy):
         return plan.select(~np.broadcast_to(started, (n_problems,)))
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed."""
+        """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed.
+
+        Of the solver's options, those that say how many cores are used (``n_threads``, ``n_workers``) are left out:
+        they are the machine's, not the controller's.
+        """
         observation_space = self.observation_space
         assert isinstance(observation_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
         document = {
             "mpc": self.mpc.to_json(),
             "solver": self.solver_name,
-            "solver_options": self.solver_options,
+            "solver_options": plain({k: v for k, v in self.solver_options.items() if k not in OF_THE_MACHINE}),
             "exploration_noise": self.exploration_noise,
             "seed": self._seed,
             "rescue": self._fallback.rescue,
@@ -313,26 +316,34 @@ class MPCPolicy(BasePolicy):
         write_archive(path, "policy", document)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], device: torch.device | str = "auto") -> Self:
+    def load(cls, path: str | PathLike[str], device: torch.device | str = "auto", **solver_options: Any) -> Self:
         """Reads what :meth:`save` wrote.
 
         Args:
             path: The file.
             device: Accepted for SB3; MPCs are solved on the CPU.
+            **solver_options: Options of the solver that go before the file's, e.g. ``n_threads=4``.
 
         Raises:
             FileFormatError: If the file is damaged, foreign or of another version.
+            InvalidArgumentError: For an option that the solver has not.
         """
         document, _ = read_archive(path, "policy")
         with file_errors(path):
+            options, solver = dict(document["solver_options"]), document["solver"]
+            if foreign := OF_THE_MACHINE & options.keys():
+                raise FileFormatError("solver_options", expected="none of the machine", actual=", ".join(foreign))
+            check_solver(solver, options)
+        check_solver(solver, options | solver_options)
+        with file_errors(path):
             return cls(
                 MPC.from_json(document["mpc"]),
-                document["solver"],
+                solver,
                 observation_space=box_from_json(document["observation_space"]),
                 action_space=box_from_json(document["action_space"]),
                 exploration_noise=document.get("exploration_noise", 0.1),
                 seed=document.get("seed", 0),
                 rescue=document.get("rescue"),
                 rescue_time=document.get("rescue_time", 1.0),
-                **document["solver_options"],
+                **(options | solver_options),
             )

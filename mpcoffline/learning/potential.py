@@ -10,6 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mpcoffline.core import limits
+from mpcoffline.core.limits import check_limit
+from mpcoffline.errors import FileFormatError
+
 Array = NDArray[np.float64]
 
 
@@ -41,10 +45,19 @@ class Potential:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Potential:
-        """The inverse of :meth:`to_json`."""
-        potential = cls(torch.zeros(1, len(data["mean"])))
-        potential._mean, potential._scale = (torch.tensor(data[n], dtype=torch.float64) for n in ("mean", "scale"))
-        potential.coefficients = torch.tensor(data["coefficients"], dtype=torch.float64)
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FileFormatError: For other sizes, or numbers that are not finite.
+        """
+        n = len(data["mean"])
+        check_limit("potential", "coordinates", n, limits.STATES)
+        potential = cls(torch.zeros(1, n))
+        arrays = {name: torch.tensor(data[name], dtype=torch.float64) for name in ("mean", "scale", "coefficients")}
+        found = [(tuple(array.shape), bool(array.isfinite().all())) for array in arrays.values()]
+        if found != [((n,), True), ((n,), True), ((len(potential.coefficients),), True)]:
+            raise FileFormatError("potential", expected=f"finite numbers of {n} coordinates", actual=str(found))
+        potential._mean, potential._scale, potential.coefficients = arrays.values()
         return potential
 
     def monomials(self, observations: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from .potential import Potential
 from .progress import Metrics, Report, silent
 from .refit import refit_cost
 from .value import ValueFunction, cosine
+from .value_network import same_shape
 
 Array = NDArray[np.float64]
 
@@ -260,19 +261,27 @@ class ParameterTraining:
         """Takes over a state from :meth:`to_arrays` of a training with the same arguments.
 
         Raises:
-            FileFormatError: If arrays are missing.
+            FileFormatError: If arrays are missing or of another problem.
         """
-        missing = {"z", "steps"} - set(arrays)
-        if missing:
-            raise FileFormatError("state of (FIT)", expected="z and steps", actual=f"no {', '.join(sorted(missing))}")
-        self.attempt, self.step = (int(n) for n in arrays["steps"])
-        for _ in range(self.attempt * self.n_steps + self.step):
+        try:
+            attempt, step = (int(n) for n in arrays["steps"].tolist())
+            if not (0 <= attempt <= self.config.n_restarts and 0 <= step <= self.n_steps):
+                raise ValueError(f"attempt {attempt}, step {step}")
+            z = same_shape(arrays["z"], self._z)
+            kinds = {"step": torch.zeros(())} | dict.fromkeys(_MOMENTS[1:], self._z) if "exp_avg" in arrays else {}
+            moments = {name: same_shape(arrays[name], kind) for name, kind in kinds.items()}
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(
+                "state of (FIT)", expected="that of the same MPC and configuration", actual=str(error)
+            ) from error
+        self.attempt, self.step = attempt, step
+        for _ in range(attempt * self.n_steps + step):
             next(self._batches)
         self._begin()
         with torch.no_grad():
-            self._z.copy_(torch.from_numpy(arrays["z"]))
-        if "exp_avg" in arrays:
-            self._optimiser.state[self._z] = {name: torch.from_numpy(np.array(arrays[name])) for name in _MOMENTS}
+            self._z.copy_(z)
+        if moments:
+            self._optimiser.state[self._z] = moments
 
 
 def fit_parameters(

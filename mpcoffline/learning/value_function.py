@@ -116,7 +116,13 @@ class ValueFunction(nn.Module):
             first = "net.members.0." if n_members else "net."
             n_linear = sum(name.startswith(first) and name.endswith(".weight") for name in arrays)
             hidden = [len(arrays[f"{first}{2 * i}.weight"]) for i in range(n_linear - 1)]
-            value = cls(len(arrays["mean"]), hidden, max(1, n_members))
+            widths = (len(arrays["mean"]), *hidden, 1)
+            for member in range(max(1, n_members)):  # before networks of these sizes are made
+                prefix = f"net.members.{member}." if n_members else "net."
+                for layer, (width_in, width_out) in enumerate(pairwise(widths)):
+                    if arrays[f"{prefix}{2 * layer}.weight"].shape != (width_out, width_in):
+                        raise KeyError(f"{prefix}{2 * layer}.weight of shape {(width_out, width_in)}")
+            value = cls(widths[0], hidden, max(1, n_members))
             known = {"gamma": np.zeros(())} | dict(arrays)  # older files do not tell it
             value.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in known.items()})
         except (IndexError, KeyError, RuntimeError, TypeError, MPCOfflineError) as error:

@@ -183,12 +183,30 @@ class Member:
         return arrays
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Takes over what :meth:`to_arrays` gave."""
+        """Takes over what :meth:`to_arrays` gave.
+
+        Raises:
+            KeyError: If an array is missing.
+            ValueError: If one is of another shape.
+        """
         for i, (weights, target) in enumerate(zip(self.critic.weights, self.target.weights, strict=True)):
             with torch.no_grad():
-                weights.copy_(torch.from_numpy(arrays[f"{i}.weights"]))
-                target.copy_(torch.from_numpy(arrays[f"{i}.target"]))
+                weights.copy_(same_shape(arrays[f"{i}.weights"], weights))
+                target.copy_(same_shape(arrays[f"{i}.target"], target))
             if f"{i}.step" in arrays:
+                step = torch.zeros((), device=weights.device)
                 self._optimiser.state[weights] = {
-                    name: torch.from_numpy(np.array(arrays[f"{i}.{name}"])).to(weights.device) for name in _ADAM
+                    name: same_shape(arrays[f"{i}.{name}"], step if name == "step" else weights) for name in _ADAM
                 }
+
+
+def same_shape(array: NDArray[Any], like: Tensor) -> Tensor:
+    """An array of a file as a tensor of the shape, type and device of another; nothing is stretched over it.
+
+    Raises:
+        ValueError: If it has another shape or type.
+    """
+    found = torch.from_numpy(np.array(array))
+    if found.shape != like.shape or found.dtype != like.dtype:
+        raise ValueError(f"{found.dtype} {tuple(found.shape)} instead of {like.dtype} {tuple(like.shape)}")
+    return found.to(like.device)

@@ -19,7 +19,7 @@ from .progress import Metrics
 from .value_config import ValueConfig, cosine
 from .value_function import ValueFunction, tanh_network
 from .value_methods import Residual, ValueMethod
-from .value_network import Member
+from .value_network import Member, same_shape
 from .value_noise import Stochasticity, estimate_stochasticity
 from .value_units import Units
 
@@ -141,8 +141,10 @@ class ValueTraining:
             counters, losses = arrays["counters"].tolist(), arrays["losses"].tolist()
             for i, member in enumerate(self._members):
                 member.restore({name[len(f"{i}.") :]: a for name, a in arrays.items() if name.startswith(f"{i}.")})
-                self._best[i].copy_(torch.from_numpy(arrays[f"{i}.best"]))
+                self._best[i].copy_(same_shape(arrays[f"{i}.best"], self._best[i]))
             step, self._best_step, self._skipped = counters
+            if not self.step <= step <= self.n_steps:
+                raise ValueError(f"step {step} of {self.n_steps}")
             self._validation_loss, self._best_loss = losses
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise FileFormatError(

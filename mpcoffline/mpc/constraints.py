@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpcoffline.core.text import check_name
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .expressions import function_from_json, function_to_json, traced
@@ -53,7 +54,7 @@ class Constraint:
         terminal: Whether it holds at the end of the horizon.
 
     Raises:
-        InvalidArgumentError: For an empty name, or a penalty that is negative or zero altogether.
+        InvalidArgumentError: For a name that is empty or not of the alphabet of names, or a penalty that is negative or zero altogether.
     """
 
     function: ConstraintFunction | ca.Function
@@ -62,7 +63,7 @@ class Constraint:
     terminal: bool = False
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        check_name("name of a constraint", self.name)
         object.__setattr__(self, "soft", _checked_penalty(self.name, self.soft))
 
     def fitted(self, sizes: Sizes) -> Constraint:
@@ -122,7 +123,7 @@ class StateBounds:
     soft: Penalty | None = None
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        check_name("name of a constraint", self.name)
         object.__setattr__(self, "soft", _checked_penalty(self.name, self.soft))
         low, high = (np.atleast_1d(np.array(bound, dtype=np.float64)) for bound in (self.low, self.high))
         if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
@@ -214,11 +215,6 @@ def _from_json(data: Mapping[str, Any], sizes: Sizes) -> AnyConstraint:
     inputs = (sizes.nx, sizes.parameters.size) if data["terminal"] else (sizes.nx, sizes.nu, sizes.parameters.size)
     # Not by its own name: CasADi takes no blanks in it.
     return Constraint(function_from_json(data["function"], "constraint", inputs=inputs), name, soft, data["terminal"])
-
-
-def _check_name(name: object) -> None:
-    if not isinstance(name, str) or not name:
-        raise InvalidArgumentError("name of a constraint", expected="a text", actual=repr(name))
 
 
 def _checked_penalty(name: str, penalty: Penalty | None) -> Penalty | None:

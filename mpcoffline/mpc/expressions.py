@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from mpcoffline.core import limits
+from mpcoffline.core.limits import check_limit
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 _UNARY = (  # noqa: SIM905 -- one per line would fill the page
@@ -70,8 +72,9 @@ def traced(name: str, function: ca.Function) -> ca.Function:
     """The SX function itself, refused where tracing lost an expression: ``math.sin(x)`` of a symbol is silently NaN.
 
     Raises:
-        InvalidArgumentError: If a constant of the function is NaN.
+        InvalidArgumentError: If a constant of the function is NaN, or it has more operations than can be solved with.
     """
+    check_limit(name, "operations", function.n_instructions(), limits.EXPRESSION_NODES, error=InvalidArgumentError)
     if any(np.isnan(instruction.constant) for instruction in instructions(function)):
         raise InvalidArgumentError(
             name,
@@ -124,15 +127,16 @@ def function_from_json(data: Any, name: str, *, inputs: tuple[int, ...], output:
         FileFormatError: If the data are damaged or describe a function of other sizes.
     """
     try:
-        sizes, n_out = tuple(data["inputs"]), data["output"]
+        sizes, n_out, program = tuple(data["inputs"]), data["output"], data["instructions"]
         if sizes != inputs or output not in (None, n_out):
             raise FileFormatError(
                 name,
                 expected=f"inputs of sizes {inputs}, {output or 'any'} outputs",
                 actual=f"inputs of sizes {sizes}, {n_out} outputs",
             )
-        symbols = [ca.SX.sym(f"i{i}", size) for i, size in enumerate(sizes)]
-        results = _replayed(data["instructions"], [ca.vertsplit(symbol) for symbol in symbols])
+        check_limit(name, "operations", len(program), limits.EXPRESSION_NODES)
+        symbols = [ca.SX.sym(f"i{i}", size) for i, size in enumerate(inputs)]
+        results = _replayed(program, [dict(enumerate(ca.vertsplit(symbol))) for symbol in symbols])
         column = ca.vertcat(*(results[k] for k in range(n_out)))
     except (KeyError, IndexError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
         if isinstance(error, FileFormatError):
@@ -143,17 +147,20 @@ def function_from_json(data: Any, name: str, *, inputs: tuple[int, ...], output:
     return ca.Function(name, symbols, [ca.densify(column)])
 
 
-def _replayed(program: list[list[Any]], inputs: list[list[ca.SX]]) -> dict[int, ca.SX]:
+def _replayed(program: list[list[Any]], inputs: list[dict[int, ca.SX]]) -> dict[int, ca.SX]:
     """The outputs by element, from running the program on symbols."""
     work: dict[int, ca.SX] = {}
     outputs: dict[int, ca.SX] = {}
     for op, target, *arguments in program:
         if op == "const":
             (value,) = arguments
-            work[target] = ca.SX(float(value))
+            number = float(value)
+            if np.isnan(number):
+                raise ValueError("a constant NaN")
+            work[target] = ca.SX(number)
         elif op == "input":
             i, element = arguments
-            work[target] = dict(enumerate(inputs[i]))[element]
+            work[target] = inputs[i][element]
         elif op == "output":
             (source,) = arguments
             outputs[target] = work[source]

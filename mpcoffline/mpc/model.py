@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.checks import check_integers
+from mpcoffline.core import limits
+from mpcoffline.core.limits import check_limit
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import Component, blocks_from_json
@@ -53,7 +55,7 @@ class Model(Component):
         *,
         discrete: bool = False,
     ) -> None:
-        check_integers(1, nx=nx, nu=nu)
+        _check_sizes(nx, nu)
         if not (np.isfinite(dt) and dt > 0.0):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
         self.nx, self.nu, self.dt = int(nx), int(nu), float(dt)
@@ -131,13 +133,21 @@ class Model(Component):
             FileFormatError: If the function is damaged or of other shapes.
         """
         model = cls.__new__(cls)
-        model.nx, model.nu, model.dt = int(data["nx"]), int(data["nu"]), float(data["dt"])
+        _check_sizes(data["nx"], data["nu"])
+        model.nx, model.nu, model.dt = data["nx"], data["nu"], float(data["dt"])
         if not (np.isfinite(model.dt) and model.dt > 0.0):
             raise FileFormatError("model.dt", expected="a positive number of seconds", actual=str(data["dt"]))
         model.space = blocks_from_json(data)
         sizes = (model.nx, model.nu, model.space.size)
         model.function = function_from_json(data["function"], "model", inputs=sizes, output=model.nx)
         return model
+
+
+def _check_sizes(nx: object, nu: object) -> None:
+    """Refuses numbers of states and inputs that are none, or more than can be solved with."""
+    check_integers(1, nx=nx, nu=nu)
+    for name, size, most in (("nx", nx, limits.STATES), ("nu", nu, limits.INPUTS)):
+        check_limit(name, "of them", int(str(size)), most, error=InvalidArgumentError)
 
 
 def rk4_expression(f: Callable[[ca.SX], ca.SX], x: ca.SX, dt: float) -> ca.SX:

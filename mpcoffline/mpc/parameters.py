@@ -9,12 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpcoffline.core import limits
+from mpcoffline.core.limits import check_limit
+from mpcoffline.core.text import LONGEST, check_name, check_unit
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 
 Array = NDArray[np.float64]
@@ -22,6 +25,7 @@ Kind = Literal["free", "psd"]
 Group = Literal["model", "cost", "terminal", "reference"]
 
 _PSD_TOLERANCE = 1e-9
+_PREFIX = 20  # characters that an MPC puts in front of a name
 
 
 @dataclass(frozen=True)
@@ -32,10 +36,10 @@ class Parameter:
         value: Initial value; any shape of at most two dimensions.
         low: Lower bound, a number or an array of the value's shape.
         high: Upper bound, likewise.
-        unit: Physical unit, for people.
+        unit: Physical unit, for people, of the characters that names may have.
 
     Raises:
-        InvalidArgumentError: If the value is not finite or lies outside the bounds.
+        InvalidArgumentError: If the value is not finite or lies outside the bounds, or the unit has other characters.
     """
 
     value: ArrayLike
@@ -44,6 +48,7 @@ class Parameter:
     unit: str = ""
 
     def __post_init__(self) -> None:
+        check_unit("Parameter unit", self.unit)
         value, low, high = (np.asarray(v, dtype=np.float64) for v in (self.value, self.low, self.high))
         if not np.isfinite(value).all() or value.ndim > 2:
             raise InvalidArgumentError(
@@ -60,7 +65,8 @@ class Block:
     """One named parameter inside theta.
 
     Attributes:
-        name: Name, dotted once it is part of an MPC (``"model.m"``).
+        name: Name, dotted once it is part of an MPC (``"model.m"``); letters of any script, digits, blanks and
+            ``_-.,^*/()[]+%°µ·²³``, up to 100.
         shape: Natural shape: ``()``, ``(n,)`` or ``(n, m)``.
         theta: Its coordinates, ``(size,)``: the entries in row-major order, or for ``kind="psd"`` the lower triangle
             of C in ``W = C C'``, row by row.
@@ -68,7 +74,10 @@ class Block:
         high: Upper bounds, ``(size,)``.
         kind: ``"free"`` or ``"psd"``.
         group: What it belongs to; learning selects by group.
-        unit: Physical unit, for people.
+        unit: Physical unit, for people; of the same characters.
+
+    Raises:
+        InvalidArgumentError: For a name, unit, kind or group that is none.
     """
 
     name: str
@@ -80,10 +89,22 @@ class Block:
     group: Group = "cost"
     unit: str = ""
 
+    def __post_init__(self) -> None:
+        check_name("parameter name", self.name, longest=LONGEST + _PREFIX)
+        check_unit(f"unit of {self.name}", self.unit)
+        for what, given, known in (("kind", self.kind, Kind), ("group", self.group, Group)):
+            if given not in get_args(known):
+                raise InvalidArgumentError(
+                    f"{what} of {self.name}",
+                    expected=f"one of {', '.join(get_args(known))}",
+                    actual=repr(given)[:LONGEST],
+                )
+
     @classmethod
     def free(cls, name: str, parameter: Parameter | ArrayLike, group: Group) -> Block:
         """A block whose coordinates are its entries."""
         spec = parameter if isinstance(parameter, Parameter) else Parameter(parameter)
+        check_name("parameter name", name)
         value = np.asarray(spec.value, dtype=np.float64)
         low, high = (np.broadcast_to(np.asarray(b, np.float64), value.shape) for b in (spec.low, spec.high))
         return cls(name, value.shape, value.ravel(), low.ravel(), high.ravel(), "free", group, spec.unit)
@@ -95,6 +116,7 @@ class Block:
         Raises:
             InvalidArgumentError: If the matrix is not square, symmetric, finite and positive semidefinite.
         """
+        check_name("parameter name", name)
         value = np.atleast_2d(np.asarray(matrix, dtype=np.float64))
         factor = psd_factor(value, name)
         rows, columns = np.tril_indices(len(value))
@@ -175,13 +197,19 @@ class Block:
         theta = np.array(data["theta"], dtype=np.float64)
         low = np.array([-np.inf if v is None else v for v in data["low"]], dtype=np.float64)
         high = np.array([np.inf if v is None else v for v in data["high"]], dtype=np.float64)
-        shape = tuple(int(n) for n in data["shape"])
-        block = cls(data["name"], shape, theta, low, high, data["kind"], data["group"], data["unit"])
+        shape = tuple(data["shape"])
+        if len(shape) > 2 or any(type(n) is not int or not 0 <= n <= limits.PARAMETERS for n in shape):
+            raise FileFormatError("parameter shape", expected="at most 2 sizes", actual=repr(data["shape"])[:LONGEST])
+        name = check_name("parameter name", data["name"], error=FileFormatError)
+        try:
+            block = cls(name, shape, theta, low, high, data["kind"], data["group"], data["unit"])
+        except InvalidArgumentError as error:
+            raise FileFormatError(error.name, expected=error.expected, actual=error.actual) from error
         n = shape[0] if shape else 1
         size = n * (n + 1) // 2 if block.kind == "psd" else int(np.prod(shape))
         square = block.kind == "free" or (block.kind == "psd" and shape == (n, n))
         if not square or not theta.shape == low.shape == high.shape == (size,):
-            raise FileFormatError(f"parameter {block.name}", expected=f"{size} coordinates", actual=str(data))
+            raise FileFormatError(f"parameter {block.name}", expected=f"{size} coordinates", actual=str(data)[:300])
         try:
             ParameterSpace([block]).checked(theta)
         except InvalidArgumentError as error:
@@ -194,6 +222,9 @@ class ParameterSpace(Sequence[Block]):
 
     Args:
         blocks: The blocks; names must be unique.
+
+    Raises:
+        InvalidArgumentError: If a name occurs twice, or there are more coordinates than files may hold.
     """
 
     def __init__(self, blocks: Sequence[Block]) -> None:
@@ -205,6 +236,7 @@ class ParameterSpace(Sequence[Block]):
                 raise InvalidArgumentError("parameter names", expected="unique names", actual=f"{block.name} twice")
             self.slices[block.name] = slice(start, start + block.size)
             start += block.size
+        check_limit("parameters", "coordinates", start, limits.PARAMETERS, error=InvalidArgumentError)
         self.size = start
 
     def __repr__(self) -> str:

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.checks import check_integers
+from mpcoffline.core import limits
+from mpcoffline.core.limits import check_limit
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import StageCost, TerminalCost
@@ -46,7 +48,7 @@ class MPC:
             :class:`Constraint` and :class:`StateBounds`, which are named, may be soft, and may hold at the end only.
 
     Raises:
-        InvalidArgumentError: For a non-positive horizon, a discount outside (0, 1], bounds that cross or have the wrong
+        InvalidArgumentError: For a horizon that is not positive or above 10,000 steps, a discount outside (0, 1], bounds that cross or have the wrong
             shape, or costs and constraints that do not fit the model's dimensions.
     """
 
@@ -61,6 +63,9 @@ class MPC:
 
     def __post_init__(self) -> None:
         check_integers(1, horizon=self.horizon)
+        check_limit("horizon", "steps", self.horizon, limits.HORIZON, error=InvalidArgumentError)
+        plan = self.horizon * (self.nx + self.nu)
+        check_limit("horizon", "numbers in a plan", plan, limits.PLAN_NUMBERS, error=InvalidArgumentError)
         discount = _discount(self.discount)
         low, high = (self._bounds(name) for name in ("action_low", "action_high"))
         if not (low < high).all():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
@@ -14,6 +15,7 @@ from .ddp import CompilerError, DDPSolver
 from .interface import Plan, Solution, Solver
 from .lqr import LQRSolver
 from .nlp import IpoptSolver
+from .options import check_options
 
 __all__ = [
     "SOLVERS",
@@ -51,24 +53,34 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
         InvalidArgumentError: If the solver named does not support the problem, or for an option that it has not.
         CompilerError: If ``"ddp"`` is named and there is no working C compiler; ``"auto"`` warns and takes ipopt.
     """
-    if name == "auto":
-        return _fastest(mpc, options)
-    if name not in SOLVERS:
+    check_solver(name, options)
+    return _fastest(mpc, options) if name == "auto" else SOLVERS[name](mpc, **options)
+
+
+def check_solver(name: str, options: Mapping[str, Any]) -> None:
+    """Refuses a solver or options that there are not, without building anything.
+
+    Args:
+        name: As of :func:`make_solver`.
+        options: Options of that solver's constructor.
+
+    Raises:
+        UnknownIdError: For an unknown name.
+        InvalidArgumentError: For an option that the solver has not, or a value out of range.
+    """
+    if name != "auto" and name not in SOLVERS:
         raise UnknownIdError.of("solver", name, ["auto", *SOLVERS])
-    if unknown := _unknown_options(name, options):
+    known = _options(name) if name != "auto" else sorted({option for each in SOLVERS for option in _options(each)})
+    if unknown := [option for option in options if option not in known]:
+        kind = "the solvers" if name == "auto" else f"the {name} solver"
         raise InvalidArgumentError(
-            f"options of the {name} solver", expected=f"some of {', '.join(_options(name))}", actual=", ".join(unknown)
+            f"options of {kind}", expected=f"some of {', '.join(known)}", actual=", ".join(unknown)
         )
-    return SOLVERS[name](mpc, **options)
+    check_options(options)
 
 
 def _fastest(mpc: MPC, options: dict[str, Any]) -> Solver:
     """The first of :data:`SOLVERS` that supports the problem."""
-    known = {option for name in SOLVERS for option in _options(name)}
-    if not options.keys() <= known:
-        raise InvalidArgumentError(
-            "options of the solvers", expected=f"some of {', '.join(sorted(known))}", actual=", ".join(options)
-        )
     refusals: list[str] = []
     no_compiler = ""
     for name, solver_class in SOLVERS.items():

@@ -10,12 +10,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, OneAtATime, Plan, Solution, Solver
 from .linear_quadratic import is_convex
+from .options import check_options
 from .starts import N_CANDIDATES, candidate_inputs
 from .transcription import Multipliers, Transcription
 from .workers import WorkerPool
@@ -66,9 +66,14 @@ class IpoptSolver(Solver):
         )
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
-        check_integers(1, max_iterations=max_iterations, n_workers=n_workers)
-        if not max_time > 0.0:
-            raise InvalidArgumentError("max_time", expected="a positive number of seconds", actual=str(max_time))
+        check_options(
+            {
+                "tolerance": tolerance,
+                "max_iterations": max_iterations,
+                "max_time": max_time,
+                "n_workers": n_workers,
+            }
+        )
         self._n_starts = n_starts or (1 if is_convex(mpc) else 4)
         self._options: dict[str, Any] = {
             "n_starts": self._n_starts,

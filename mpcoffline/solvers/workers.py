@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.mpc import MPC
-from mpcoffline.parallel import Workers
+from mpcoffline.parallel import Workers, n_cpus
 
 from .interface import Array, Plan
 
@@ -34,7 +34,7 @@ class WorkerPool:
     Args:
         mpc: The problem.
         options: Of the solver.
-        n_workers: Number of processes.
+        n_workers: Number of processes, at most; there are never more than processors or problems.
 
     Raises:
         InvalidArgumentError: For an MPC that cannot be written to JSON, which is how it travels.
@@ -50,7 +50,7 @@ class WorkerPool:
             ) from error
         self._task, self._n_workers = _Task(document, dict(options)), n_workers
         self._workers: Workers[_Part, list[Found]] | None = None
-        self._process = os.getpid()
+        self._n_started, self._process = 0, os.getpid()
 
     def solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
         """The solutions in the order of the problems."""
@@ -68,8 +68,10 @@ class WorkerPool:
         }
         if self._process != os.getpid():  # a fork: the workers are its parent's
             self._workers, self._process = None, os.getpid()
-        if self._workers is None:
-            self._workers = Workers(self._task, self._n_workers)
+        wanted = min(self._n_workers, n, n_cpus())
+        if self._workers is None or wanted > self._n_started:
+            self.close()
+            self._workers, self._n_started = Workers(self._task, wanted), wanted
         try:
             found = dict(self._workers.run(jobs))
         except BaseException:  # Ctrl-C, a worker that died: no process stays behind, the next batch starts new ones
@@ -81,7 +83,7 @@ class WorkerPool:
         """Ends the processes."""
         if self._workers is not None:
             self._workers.close()
-            self._workers = None
+            self._workers, self._n_started = None, 0
 
 
 class _Task:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import Array, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
+from mpcoffline.solvers.options import check_options
 from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
 
 from .build import compiled
@@ -109,7 +109,7 @@ class DDPSolver(Solver):
                 actual="constraints",
                 hint="Use ipopt.",
             )
-        check_integers(1, max_iterations=max_iterations, n_threads=n_threads)
+        check_options({"max_iterations": max_iterations, "tolerance": tolerance, "n_threads": n_threads})
         if n_starts is None:
             n_starts = 1 if is_convex(mpc) else 16
         if not 1 <= n_starts <= N_CANDIDATES:
