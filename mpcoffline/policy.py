@@ -16,8 +16,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
-from mpcoffline.checks import check_integers
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.checks import check_integers, check_name
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import SOLVERS, Plan, Solution, Solver, make_solver
 
@@ -99,8 +99,7 @@ class MPCPolicy(BasePolicy):
         ):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
                 raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
-        if solver != "auto" and solver not in SOLVERS:
-            raise UnknownIdError.of("solver", solver, ["auto", *SOLVERS])
+        check_name("solver", solver, ["auto", *SOLVERS])
         super().__init__(observation_space, action_space)
         self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
         self.solver_stats = SolverStats()

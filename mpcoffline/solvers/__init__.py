@@ -7,7 +7,8 @@ import logging
 import warnings
 from typing import Any
 
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.checks import check_name
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .ddp import CompilerError, DDPSolver
@@ -51,10 +52,9 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
         InvalidArgumentError: If the solver named does not support the problem, or for an option that it has not.
         CompilerError: If ``"ddp"`` is named and there is no working C compiler; ``"auto"`` warns and takes ipopt.
     """
+    check_name("solver", name, ["auto", *SOLVERS])
     if name == "auto":
         return _fastest(mpc, options)
-    if name not in SOLVERS:
-        raise UnknownIdError.of("solver", name, ["auto", *SOLVERS])
     if unknown := _unknown_options(name, options):
         raise InvalidArgumentError(
             f"options of the {name} solver", expected=f"some of {', '.join(_options(name))}", actual=", ".join(unknown)
