@@ -49,20 +49,20 @@ class UnknownIdError(MPCOfflineError, LookupError):
     """An environment, data set, solver or preset of this name does not exist."""
 
     @classmethod
-    def of(cls, kind: str, given: str, known: Iterable[str], hint: str = "") -> UnknownIdError:
+    def of(cls, kind: str, given: object, known: Iterable[str], hint: str = "") -> UnknownIdError:
         """Builds the error with the nearest known names first.
 
         Args:
             kind: What the name stands for, e.g. ``"dataset id"``.
-            given: The unknown name.
+            given: The unknown name, or whatever was given in place of one.
             known: All names that would have been right.
             hint: What to do next; by default the nearest names are proposed.
         """
         names = sorted(known)
-        nearest = difflib.get_close_matches(given, names, n=3, cutoff=0.4)
+        nearest = difflib.get_close_matches(given, names, n=3, cutoff=0.4) if isinstance(given, str) else []
         if not hint and nearest:
             hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}?"
-        return cls(kind, expected=f"one of {', '.join(names) or '(none)'}", actual=repr(given), hint=hint)
+        return cls(kind, expected=f"one of {', '.join(names) or '(none)'}", actual=f"{given!r:.200}", hint=hint)
 
 
 class FileFormatError(MPCOfflineError, ValueError):

@@ -11,9 +11,22 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from mpcoffline.checks import check_integers
+from mpcoffline.checks import check_integers, checked_seed
+from mpcoffline.datasets.plants import (
+    check_spaces,
+    check_unchanged,
+    check_units,
+    in_units,
+    is_mpc,
+    no_end,
+    opened,
+    step_cap,
+)
+from mpcoffline.datasets.rebuilding import rebuilt_spec, without_window
+from mpcoffline.datasets.stage_cost import PlantInfo, number_of, reward_of
+from mpcoffline.datasets.watching import PlantWatch
 from mpcoffline.envs import ControlTask
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.errors import InvalidArgumentError
 
 Array = NDArray[np.float64]
 
@@ -41,7 +54,8 @@ class Evaluation:
         success: The environment's ``info["is_success"]`` after the last step, ``(n,)``.
         length: Steps, ``(n,)``.
         discount: gamma of ``discounted_cost``.
-        states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment gives none.
+        states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment does not
+            give one at each step.
         actions: Actions applied, ``(T, nu)``.
     """
 
@@ -68,51 +82,85 @@ def evaluate(
     *,
     discount: float = 0.9,
     options: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
+    cost_key: str | None = None,
+    max_episode_steps: int | None = None,
 ) -> Evaluation:
     """Runs a policy in closed loop.
 
-    The environment is rebuilt ``n_episodes`` times from ``env.spec``; all copies step together, so that a policy solves
-    its MPCs in batches. Episode i is reset with ``seed + i``: two policies meet the same starts.
+    The environment is rebuilt ``n_episodes`` times from its spec, without windows; all copies step together, so that a
+    policy solves its MPCs in batches. Where that would be another environment (wrappers around it, attributes set on
+    it, no spec), the given one itself is stepped, one episode after the other. Episode i is reset with ``seed + i``:
+    two policies meet the same starts.
+
+    The cost is the plant's: minus the reward below wrappers that change it, or ``info["cost"]`` in its place where the
+    two are the same in float32. Where they are not, that key means something else (a violated limit, as in safe RL),
+    and the reward counts, which a warning says once.
 
     Args:
-        policy: Anything with SB3's ``predict``.
-        env: An environment made by ``gym.make``, or its id.
+        policy: Anything with SB3's ``predict``. An agent that learned under ``VecNormalize`` gets its observations
+            normalised where it has the statistics.
+        env: An environment or its id; not a vector environment. An MPC is refused wrappers that rescale.
         n_episodes: Number of episodes.
         seed: Seed of the first episode.
         discount: gamma of the discounted cost.
         options: ``reset`` options, the same for all episodes or one a episode.
+        cost_key: The key of ``info`` that *is* the stage cost, minus the plant's reward; by default ``"cost"``, where
+            it proves to be. A key that is named must be there and equal at each step.
+        max_episode_steps: Steps after which an episode is one without end, an error; by default 100,000, or the
+            environment's own limit where that is larger.
 
     Returns:
         Costs and trajectories.
 
     Raises:
-        InvalidArgumentError: For a non-positive number of episodes, options of another length, or an environment
-            without spec.
+        InvalidArgumentError: For a non-positive number of episodes, options of another length, a policy of other
+            spaces, an MPC in an environment under wrappers that rescale, an episode without end, or a missing
+            ``cost_key``.
+        InvalidDataError: For a reward that is no number, or not minus the cost that ``cost_key`` names.
         UnknownIdError: For an environment id that is not registered.
     """
     check_integers(1, n_episodes=n_episodes)
+    first_seed, number = checked_seed("seed", seed), int(n_episodes)
     if not 0.0 < discount <= 1.0:
         raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=str(discount))
-    if not isinstance(env, str | gym.Env):
-        raise InvalidArgumentError(
-            "env",
-            expected="a Gymnasium environment or the id of one",
-            actual=type(env).__name__,
-            hint="Vector environments go to stable_baselines3's evaluate_policy; here copies step together anyway.",
-        )
-    spec = _registered(env) if isinstance(env, str) else env.spec
+    each = [options or {}] * number if options is None or isinstance(options, dict) else list(options)
+    if len(each) != number:
+        raise InvalidArgumentError("options", expected=f"{number} entries", actual=str(len(each)))
+    given = opened(env)
+    rule, cap = PlantInfo("evaluate", cost_key), step_cap(given, max_episode_steps)
+    try:
+        check_spaces(policy, given)
+        if is_mpc(policy):
+            check_units(given)
+        actor, our_task = in_units(policy), isinstance(given.unwrapped, ControlTask)
+        spec = rebuilt_spec(given) if given is env else without_window(given.spec) if given.spec is not None else None
+    finally:
+        if given is not env:
+            given.close()
     if spec is None:
-        raise InvalidArgumentError("env", expected="an environment made by gym.make", actual=f"{env} without a spec")
-    each = [options or {}] * n_episodes if options is None or isinstance(options, dict) else list(options)
-    if len(each) != n_episodes:
-        raise InvalidArgumentError("options", expected=f"{n_episodes} entries", actual=str(len(each)))
-    if spec.vector_entry_point and not spec.additional_wrappers and _is_our_task(spec):
-        return _evaluate_as_arrays(policy, spec, each, seed, discount)
-    return _evaluate_one_by_one(policy, spec, each, seed, discount)
+        episodes = _one_after_the_other(actor, given, each, first_seed, rule, cap)
+    elif our_task and spec.vector_entry_point and not spec.additional_wrappers and cost_key in (None, "cost"):
+        return _evaluate_as_arrays(actor, spec, each, first_seed, discount, cap)
+    else:
+        episodes = [_Episode(gym.make(spec), first_seed + i, option, rule, i) for i, option in enumerate(each)]
+        try:
+            _step_together(actor, episodes, cap)
+        finally:
+            for episode in episodes:
+                episode.close()
+    return Evaluation(
+        cost=np.array([episode.costs.sum() for episode in episodes]),
+        discounted_cost=np.array([discount ** np.arange(len(e.costs)) @ e.costs for e in episodes]),
+        success=np.array([episode.success for episode in episodes]),
+        length=np.array([len(episode.actions) for episode in episodes]),
+        discount=discount,
+        states=[np.array(episode.states if rule.has_state else episode.observations) for episode in episodes],
+        actions=[np.array(episode.actions) for episode in episodes],
+    )
 
 
 def _evaluate_as_arrays(
-    policy: Predictor, spec: EnvSpec, options: Sequence[dict[str, Any]], seed: int, discount: float
+    policy: Predictor, spec: EnvSpec, options: Sequence[dict[str, Any]], seed: int, discount: float, cap: int
 ) -> Evaluation:
     """Our own tasks: their vector twin, which equals them bit for bit and ends all episodes at the same step."""
     n = len(options)
@@ -128,6 +176,8 @@ def _evaluate_as_arrays(
         states.append(info["state"])
         actions.append(np.asarray(action, dtype=np.float64))
         costs.append(info["cost"])
+        if len(costs) >= cap and not done.all():
+            raise no_end("env, episode 0", cap)
     each_cost = np.stack(costs)
     return Evaluation(
         cost=each_cost.sum(axis=0),
@@ -140,11 +190,23 @@ def _evaluate_as_arrays(
     )
 
 
-def _evaluate_one_by_one(
-    policy: Predictor, spec: EnvSpec, options: Sequence[dict[str, Any]], seed: int, discount: float
-) -> Evaluation:
-    """Any environment: copies of it, stepped in turn, with one prediction for all."""
-    episodes = [_Episode(gym.make(spec), seed + i, option, discount) for i, option in enumerate(options)]
+def _one_after_the_other(
+    policy: Predictor, env: gym.Env[Any, Any], options: Sequence[dict[str, Any]], seed: int, rule: PlantInfo, cap: int
+) -> list[_Episode]:
+    """Steps the given environment itself."""
+    episodes = []
+    for i, option in enumerate(options):
+        episode = _Episode(env, seed + i, option, rule, i, unchanged=is_mpc(policy))
+        try:
+            _step_together(policy, [episode], cap)
+        finally:
+            episode.watch.remove()
+        episodes.append(episode)
+    return episodes
+
+
+def _step_together(policy: Predictor, episodes: Sequence[_Episode], cap: int) -> None:
+    """Steps environments in turn, with one prediction for all, until all have ended."""
     state: Any = None
     starts = np.ones(len(episodes), dtype=bool)
     while not all(episode.done for episode in episodes):
@@ -152,60 +214,65 @@ def _evaluate_one_by_one(
         actions, state = policy.predict(observations, state=state, episode_start=starts, deterministic=True)
         starts = np.zeros(len(episodes), dtype=bool)
         for episode, action in zip(episodes, actions, strict=True):
-            episode.step(action)
-    return Evaluation(
-        cost=np.array([episode.cost for episode in episodes]),
-        discounted_cost=np.array([episode.discounted_cost for episode in episodes]),
-        success=np.array([episode.success for episode in episodes]),
-        length=np.array([len(episode.actions) for episode in episodes]),
-        discount=discount,
-        states=[np.array(episode.states) for episode in episodes],
-        actions=[np.array(episode.actions) for episode in episodes],
-    )
-
-
-def _is_our_task(spec: EnvSpec) -> bool:
-    env: gym.Env[Any, Any] = gym.make(spec)
-    env.close()
-    return isinstance(env.unwrapped, ControlTask)
-
-
-def _registered(env_id: str) -> EnvSpec | None:
-    """The specification of an environment id, ``"module:id"`` too."""
-    try:
-        env: gym.Env[Any, Any] = gym.make(env_id)
-    except gym.error.UnregisteredEnv as error:
-        raise UnknownIdError(
-            "environment id", expected="a registered environment", actual=repr(env_id), hint=str(error)
-        ) from error
-    env.close()
-    return env.spec
+            episode.step(action, cap)
 
 
 class _Episode:
-    """One environment and what has happened in it; steps after the end are ignored."""
+    """One episode and what has happened in it; steps after the end are ignored."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int, options: dict[str, Any], discount: float) -> None:
-        self._env, self._discount = env, discount
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        seed: int,
+        options: dict[str, Any],
+        rule: PlantInfo,
+        number: int,
+        *,
+        unchanged: bool = False,
+    ) -> None:
+        self._env, self._rule, self._number, self._unchanged = env, rule, number, unchanged
+        self.watch = PlantWatch(env)
         self.observation, info = env.reset(seed=seed, options=options or None)
-        self.cost = self.discounted_cost = 0.0
         self.success = self.done = False
-        self.states: list[Any] = [info.get("state", self.observation)]
-        self.actions: list[Any] = []
+        self.observations: list[Any] = [np.array(self.observation)]
+        self._first = rule.state(info, reset=True)
+        self._states: list[Array | None] = []
+        self._costs: list[float] = []
+        self._rewards: list[float] = []
+        self.actions: list[Array] = []
 
-    def step(self, action: NDArray[Any]) -> None:
+    @property
+    def costs(self) -> Array:
+        """The stage costs ``(T,)``: those of the infos where they count."""
+        return np.array(self._costs) if self._rule.has_cost else -np.array(self._rewards)
+
+    @property
+    def states(self) -> list[Array]:
+        """The states ``(T + 1, nx)``, where they count; an unknown first one is NaN."""
+        known = [state for state in self._states if state is not None]
+        return [np.full_like(known[0], np.nan) if self._first is None else self._first, *known]
+
+    def step(self, action: NDArray[Any], cap: int) -> None:
         """Steps the environment unless the episode is over."""
         if self.done:
             return
         observation, reward, terminated, truncated, info = self._env.step(action)
-        cost = float(info.get("cost", -float(reward)))
-        self.discounted_cost += self._discount ** len(self.actions) * cost
-        self.cost += cost
-        self.states.append(info.get("state", observation))
+        if self._unchanged:
+            check_unchanged(self._env, self.watch, action, observation)
+        given = reward_of(f"env, episode {self._number}", reward)
+        paid = given if self.watch.reward is None else self.watch.reward
+        self._costs.append(self._rule.cost(info, paid, given))
+        self._rewards.append(paid)
+        self._states.append(self._rule.state(info))
+        self.observations.append(np.array(observation))
         self.actions.append(np.asarray(action, dtype=np.float64))
         self.done = bool(terminated or truncated)
-        self.success = bool(info.get("is_success", False))
-        if self.done:
-            self._env.close()
-        else:  # a policy goes on seeing the last state before the end, which it can solve for
+        self.success = bool(number_of(info.get("is_success")) or False)
+        if not self.done:  # a policy goes on seeing the last state before the end, which it can solve for
             self.observation = observation
+            if len(self.actions) >= cap:
+                raise no_end(f"env, episode {self._number}", cap)
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self._env.close()

@@ -12,10 +12,10 @@ from gymnasium import spaces
 
 from mpcoffline.archive import box_from_json, box_to_json, file_errors, holds, read_archive, write_archive
 from mpcoffline.checkpoint import Checkpoint, History, history_from_json
-from mpcoffline.checks import check_integers
+from mpcoffline.checks import check_integers, check_known
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.transitions import TransitionTable
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.fitting import Epoch, Fit
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.mpc import MPC
@@ -85,10 +85,9 @@ class OfflineMPCLearner:
         device: str = "cpu",
         **overrides: Any,
     ) -> None:
-        if learn not in _GROUPS:
+        if not isinstance(learn, str) or learn not in _GROUPS:
             raise InvalidArgumentError("learn", expected="'cost' or 'cost+model'", actual=repr(learn))
-        if preset not in PRESETS:
-            raise UnknownIdError.of("preset", preset, PRESETS)
+        check_known("preset", preset, PRESETS)
         if value is not None:
             overrides["method"] = value
         check_integers(0, seed=seed)

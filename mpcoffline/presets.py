@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from mpcoffline.checks import check_integers, check_number
+from mpcoffline.checks import check_integers, check_known, check_number
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.learning import FitConfig, ValueConfig
 
@@ -67,8 +67,7 @@ class LearnerConfig:
                 hint="Set terminal='network' or 'quadratic'.",
             )
         for name, kinds in (("terminal", Terminal), ("init", Init)):
-            if getattr(self, name) not in get_args(kinds):
-                raise UnknownIdError.of(name, str(getattr(self, name)), get_args(kinds))
+            check_known(name, getattr(self, name), get_args(kinds))
 
     def replaced(self, overrides: Mapping[str, Any]) -> LearnerConfig:
         """The configuration with fields replaced by name; a name that two parts have needs a prefix.

@@ -6,22 +6,22 @@ import importlib
 import logging
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self, cast
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import get_system_info
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from mpcoffline.archive import read_archive
-from mpcoffline.checks import check_integers
+from mpcoffline.checks import check_integers, checked_seed
+from mpcoffline.datasets.plants import check_spaces, made, opened
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.learner import OfflineMPCLearner
 from mpcoffline.policy import MPCPolicy
@@ -53,7 +53,8 @@ class MPCModel(BaseAlgorithm):
         seed: Seeds the exploration noise; the policy's own seed by default.
 
     Raises:
-        InvalidArgumentError: If the environment has other spaces than the policy.
+        InvalidArgumentError: If the environment has other spaces than the policy, or is none.
+        UnknownIdError: For an environment id that is not registered.
     """
 
     policy: MPCPolicy
@@ -66,11 +67,12 @@ class MPCModel(BaseAlgorithm):
         verbose: int = 0,
         seed: int | None = None,
     ) -> None:
+        seed = None if seed is None else checked_seed("seed", seed)
         super().__init__(type(policy), env=None, learning_rate=0.0, verbose=verbose, device="cpu", seed=seed)
         self.policy, self.n_envs = policy, 1
         self.observation_space, self.action_space = policy.observation_space, policy.action_space
         if env is not None:
-            self.set_env(maybe_make_env(env, verbose))
+            self.set_env(_given(env, verbose))
         if seed is not None:
             self.policy.set_random_seed(seed)
 
@@ -87,7 +89,7 @@ class MPCModel(BaseAlgorithm):
             InvalidArgumentError: If it has other spaces than the environment.
         """
         if self.env is not None:
-            _check_spaces(policy, self.env)
+            check_spaces(policy, self.env)
             policy = policy.with_normalization(self.env) if self._vec_normalize_env is not None else policy
         self.policy = policy
 
@@ -101,8 +103,8 @@ class MPCModel(BaseAlgorithm):
         Raises:
             InvalidArgumentError: If it has other spaces than the policy.
         """
-        wrapped = self._wrap_env(env, self.verbose)
-        _check_spaces(self.policy, wrapped)
+        wrapped = self._wrap_env(_given(env, self.verbose), self.verbose)
+        check_spaces(self.policy, wrapped)
         self.n_envs = wrapped.num_envs
         self.observation_space, self.action_space = wrapped.observation_space, wrapped.action_space
         super().set_env(wrapped, force_reset)
@@ -218,26 +220,11 @@ def _read_policy(path: Path) -> MPCPolicy:
     return OfflineMPCLearner.load(path).policy
 
 
-def _check_spaces(policy: MPCPolicy, env: VecEnv) -> None:
-    """Refuses an environment that the policy was not made for, or cannot act in."""
-    if any(env.env_is_wrapped(gym.wrappers.NormalizeObservation)):
-        raise InvalidArgumentError(
-            "env",
-            expected="observations in their units, or normalised by SB3's VecNormalize",
-            actual="gymnasium.wrappers.NormalizeObservation",
-            hint="Its statistics are out of an MPC's reach.",
-        )
-    for name in ("observation_space", "action_space"):
-        own, given = getattr(policy, name), getattr(env, name)
-        same_shape = isinstance(given, spaces.Box) and given.shape == own.shape
-        unknown = name == "observation_space" and not (own.bounded_below | own.bounded_above).any()
-        if not same_shape or not (unknown or (np.allclose(own.low, given.low) and np.allclose(own.high, given.high))):
-            raise InvalidArgumentError(
-                f"env.{name}",
-                expected=f"the policy's {own}",
-                actual=str(given),
-                hint="Is it the environment that the MPC models, without wrappers that rescale?",
-            )
+def _given(env: gym.Env[Any, Any] | VecEnv | str, verbose: int) -> gym.Env[Any, Any] | VecEnv:
+    """The environment, made as SB3 makes it where its id is given; what is none is refused."""
+    if isinstance(env, str):
+        return made(env, lambda env_id: cast("gym.Env[Any, Any]", maybe_make_env(env_id, verbose)))
+    return env if isinstance(env, VecEnv) else opened(env)
 
 
 class EnvironmentEvaluator:
@@ -254,18 +241,27 @@ class EnvironmentEvaluator:
         seed: Seed of the first episode's start.
 
     Raises:
-        InvalidArgumentError: For a non-positive number of episodes.
+        InvalidArgumentError: For a non-positive number of episodes, a negative seed, or what is no environment.
+        UnknownIdError: For an environment id that is not registered.
     """
 
     def __init__(self, env: gym.Env[Any, Any] | VecEnv | str, n_episodes: int = 10, *, seed: int = 0) -> None:
         check_integers(1, n_episodes=n_episodes)
-        self._env = MPCModel._wrap_env(maybe_make_env(env, verbose=0))
-        self._n_episodes, self._seed = n_episodes, seed
+        self._env = MPCModel._wrap_env(_given(env, verbose=0))
+        self._n_episodes, self._seed = int(n_episodes), checked_seed("seed", seed)
 
     def __call__(self, learner: OfflineMPCLearner, table: TransitionTable) -> float:
-        """The mean undiscounted return, -J."""
-        self._env.seed(self._seed)
-        mean, _ = evaluate_policy(MPCModel(learner.policy, self._env), self._env, self._n_episodes, warn=False)
+        """The mean undiscounted return, -J, in the environment's own reward."""
+        statistics = unwrap_vec_normalize(self._env)
+        before = None if statistics is None else (statistics.training, statistics.norm_reward)
+        if statistics is not None:  # an evaluation neither changes its statistics nor is measured in them
+            statistics.training = statistics.norm_reward = False
+        try:
+            self._env.seed(self._seed)
+            mean, _ = evaluate_policy(MPCModel(learner.policy, self._env), self._env, self._n_episodes, warn=False)
+        finally:
+            if statistics is not None and before is not None:
+                statistics.training, statistics.norm_reward = before
         return float(np.mean(mean))
 
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from mpcoffline.checks import check_integers
+from mpcoffline.checks import check_integers, check_known
 from mpcoffline.envs import cartpole_swing_up as cartpole
 from mpcoffline.envs import linear_tracking as linear
 from mpcoffline.envs import pendulum_swing_up as pendulum
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 
 DISCOUNT = 0.9
@@ -73,9 +73,8 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
         "mpcoffline/PendulumSwingUp-v0": _pendulum,
         "mpcoffline/CartPoleSwingUp-v0": _cartpole,
     }
-    name = env_id.removeprefix("mpcoffline:")
-    if name not in builders:
-        raise UnknownIdError.of("environment id", env_id, builders)
+    name = env_id.removeprefix("mpcoffline:") if isinstance(env_id, str) else env_id
+    check_known("environment id", name, builders)
     if seed is not None:
         check_integers(0, seed=seed)
     return builders[name](alpha, seed)

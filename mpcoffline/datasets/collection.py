@@ -80,6 +80,7 @@ def collect_with(recipe: Recipe, *, overwrite: bool = False, progress: bool = Tr
         overwrite=overwrite,
         algorithm_name=f"stable_baselines3.{recipe.algorithm}",
         description=recipe.description,
+        cost_key="cost",  # the agent's reward is another
     )
     bar = _ProgressBar(recipe.steps, recorder, f"{recipe.algorithm} learns {recipe.task}") if progress else None
     callbacks: list[BaseCallback] = [recorder, _StopAt(recipe.steps), *([bar] if bar else [])]
@@ -189,7 +190,7 @@ class _FixedScale(BaseFeaturesExtractor):
 
 
 class _TrainingReward(gym.Wrapper[Any, Any, Any, Any]):
-    """The agent's reward, -c L or -sqrt(c L) instead of -L; the recorder takes ``info["cost"]``."""
+    """The agent's reward, -c L or -sqrt(c L) instead of -L; the recorder takes the plant's."""
 
     def __init__(self, env: gym.Env[Any, Any], form: str, scale: float) -> None:
         super().__init__(env)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .stage_cost import PlantInfo
+
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
-
-RECORDED_INFOS = ("cost", "state")
 
 
 class EpisodeBuilder:
@@ -19,25 +20,30 @@ class EpisodeBuilder:
 
     Args:
         observation: First observation ``(ny,)``.
-        info: The reset's info. Of the infos, ``"cost"`` and ``"state"`` are kept.
+        info: The reset's info.
+        rule: What is taken from infos, the same for all episodes of a recording.
     """
 
-    def __init__(self, observation: ArrayLike, info: Mapping[str, Any]) -> None:
+    def __init__(self, observation: ArrayLike, info: Mapping[str, Any], rule: PlantInfo) -> None:
+        self._rule = rule
         self._observations = [np.array(observation)]
         self._actions: list[NDArray[Any]] = []
         self._rewards: list[float] = []
         self._terminations: list[bool] = []
         self._truncations: list[bool] = []
-        self._infos = [_kept(info)]
+        self._costs = [rule.first_cost(info)]
+        self._states = [rule.state(info, reset=True)]
 
     def __len__(self) -> int:
         """Number of transitions."""
         return len(self._rewards)
 
     @property
-    def last_info(self) -> dict[str, NDArray[np.float64]]:
-        """What was kept of the info of the last observation."""
-        return self._infos[-1]
+    def last_info(self) -> dict[str, Any]:
+        """What was kept of the info of the last observation, as the first of another episode."""
+        state = self._states[-1]
+        known = {} if math.isnan(self._costs[-1]) else {self._rule.key: self._costs[-1]}
+        return known if state is None else known | {"state": state}
 
     def add(
         self,
@@ -48,26 +54,33 @@ class EpisodeBuilder:
         terminated: bool,
         truncated: bool,
         info: Mapping[str, Any],
+        given_reward: float | None = None,
     ) -> None:
         """Adds a transition.
 
         Args:
             action: Action ``(nu,)`` in the environment's units.
-            reward: Used where ``info`` has no ``"cost"``; there the reward recorded is -cost.
+            reward: What the plant paid.
             next_observation: The observation reached ``(ny,)``, not that of the next episode.
             terminated: Whether the environment ended in a terminal state.
             truncated: Whether a time limit cut the episode.
             info: The step's info.
+            given_reward: What a wrapper made of the reward.
+
+        Raises:
+            InvalidArgumentError: See :class:`PlantInfo`.
+            InvalidDataError: See :class:`PlantInfo`.
         """
+        self._costs.append(self._rule.cost(info, float(reward), given_reward))
+        self._states.append(self._rule.state(info))
         self._actions.append(np.array(action))
-        self._rewards.append(-float(info["cost"]) if "cost" in info else float(reward))
+        self._rewards.append(float(reward))
         self._observations.append(np.array(next_observation))
         self._terminations.append(terminated)
         self._truncations.append(truncated)
-        self._infos.append(_kept(info))
 
     def finish(self, *, truncate: bool = False) -> EpisodeBuffer:
-        """The episode as Minari stores it.
+        """The episode as Minari stores it; its reward is minus the cost where the info's cost counts.
 
         Args:
             truncate: Marks the last step as truncated unless it terminated.
@@ -77,25 +90,22 @@ class EpisodeBuilder:
         truncations = list(self._truncations)
         if truncate and truncations and not self._terminations[-1]:
             truncations[-1] = True
+        rewards = [-cost for cost in self._costs[1:]] if self._rule.has_cost else self._rewards
         return EpisodeBuffer(
             observations=np.stack(self._observations),  # type: ignore[arg-type, unused-ignore]
             actions=np.stack(self._actions),  # type: ignore[arg-type, unused-ignore]
-            rewards=np.array(self._rewards, dtype=np.float64),  # type: ignore[arg-type, unused-ignore]
+            rewards=np.array(rewards, dtype=np.float64),  # type: ignore[arg-type, unused-ignore]
             terminations=np.array(self._terminations),  # type: ignore[arg-type, unused-ignore]
             truncations=np.array(truncations),  # type: ignore[arg-type, unused-ignore]
             infos=self._stacked_infos(),
         )
 
     def _stacked_infos(self) -> dict[str, NDArray[np.float64]]:
-        """The kept infos, ``(T+1, 1)`` and ``(T+1, nx)``; a missing row (an unknown reset) is NaN."""
+        """The infos that count, ``cost (T+1, 1)`` and ``state (T+1, nx)``; an unknown first row is NaN."""
         stacked = {}
-        for key in RECORDED_INFOS:
-            known = next((info[key] for info in reversed(self._infos) if key in info), None)
-            if known is not None:
-                missing = np.full_like(known, np.nan)
-                stacked[key] = np.stack([info.get(key, missing) for info in self._infos])
+        if self._rule.has_cost:
+            stacked["cost"] = np.array(self._costs, dtype=np.float64)[:, None]
+        if self._rule.has_state:
+            missing = np.full_like(self._states[-1], np.nan, dtype=np.float64)
+            stacked["state"] = np.stack([missing if state is None else state for state in self._states])
         return stacked
-
-
-def _kept(info: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
-    return {key: np.atleast_1d(np.array(info[key], dtype=np.float64)) for key in RECORDED_INFOS if key in info}

@@ -14,14 +14,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from mpcoffline.checks import check_integers
+from mpcoffline.checks import check_integers, checked_seed
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
 from .checks import floats
-from .episodes import EpisodeBuilder
 from .minari_store import write_dataset
+from .plants import check_spaces, check_units, in_units, opened, plain_spec, step_cap
 from .recording import Recording
+from .rollouts import run_episode
+from .stage_cost import PlantInfo
 from .transitions import TransitionTable
+from .watching import plant_of
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -41,15 +44,23 @@ def record(
     overwrite: bool = False,
     algorithm_name: str | None = None,
     description: str | None = None,
+    cost_key: str | None = None,
+    max_episode_steps: int | None = None,
 ) -> MinariDataset:
     """Runs a policy and records what happens, as safely as :class:`mpcoffline.MinariRecorder`.
 
     A recording that was interrupted goes on with the episode after the last one finished; with a seed the result is the
     same as without the interruption.
 
+    What is recorded is what the plant sees and pays, in its units: the reward below wrappers that change it, and
+    -``info["cost"]`` in its place where the two are the same in float32. Where they are not, that key means something
+    else (a violated limit, as in safe RL), and the reward counts, which a warning says once. Wrappers that rescale
+    observations or actions are refused; those that add to them, stack or flatten them are recorded as they give them.
+
     Args:
-        env: The environment or its id.
-        policy: Anything with SB3's ``predict``, or a function from an observation ``(ny,)`` to an action ``(nu,)``.
+        env: The environment or its id; not a vector environment.
+        policy: Anything with SB3's ``predict``, or a function from an observation ``(ny,)`` to an action ``(nu,)``. An
+            agent that learned under ``VecNormalize`` gets its observations normalised where it has the statistics.
         n_episodes: Number of episodes.
         dataset_id: Minari id of the new data set.
         seed: Episode i starts from ``env.reset(seed=seed + i)``.
@@ -57,20 +68,34 @@ def record(
         overwrite: Whether an existing data set of this id may be replaced.
         algorithm_name: Stored as metadata; the name of the policy's class by default.
         description: Stored as metadata.
+        cost_key: The key of ``info`` that *is* the stage cost, minus the plant's reward; by default ``"cost"``, where
+            it proves to be. A key that is named must be there and equal at each step.
+        max_episode_steps: Steps after which an episode is one without end, an error; by default 100,000, or the
+            environment's own limit where that is larger.
 
     Returns:
         The stored data set.
 
     Raises:
-        InvalidArgumentError: For a bad id, another recorder at work on it, fewer than one episode, or an action
-            outside the action space; the episodes before are kept then.
+        InvalidArgumentError: For a bad id, another recorder at work on it, fewer than one episode, a policy of other
+            spaces, or wrappers that rescale. For an action outside the action space, an episode without end, or a
+            ``cost_key`` that is not there: the episodes before are kept then.
+        InvalidDataError: Where ``cost_key`` is not minus the reward; the episodes before are kept.
+        UnknownIdError: For an environment id that is not registered.
         StorageError: Where the disk refuses; the episodes before are kept.
     """
     check_integers(1, n_episodes=n_episodes)
-    made = gym.make(env) if isinstance(env, str) else env
+    first_seed = None if seed is None else checked_seed("seed", seed)
+    made = opened(env)
+    check_spaces(policy, made)
+    check_units(made)
+    actor = in_units(policy)
+    cap, rule = step_cap(made, max_episode_steps), PlantInfo("record", cost_key)
+    # Wrappers that change no space add nothing to what is recorded, and not all can be rebuilt.
+    wrappers = made.observation_space != plant_of(made).observation_space
     recording = Recording(
         dataset_id,
-        env_spec=made.spec,
+        env_spec=plain_spec(made.spec, wrappers=wrappers),
         observation_space=made.observation_space,
         action_space=made.action_space,
         mode="replace" if overwrite else "new",
@@ -79,41 +104,13 @@ def record(
     )
     try:
         for number in range(recording.resumed, n_episodes):
-            episode_seed = None if seed is None else seed + number
-            recording.append(0, _run(made, policy, number, episode_seed, deterministic), complete=True)
+            episode_seed = None if first_seed is None else first_seed + number
+            recording.append(0, run_episode(made, actor, number, episode_seed, deterministic, rule, cap), complete=True)
         return recording.seal()
     finally:
         recording.close()
         if isinstance(env, str):
             made.close()
-
-
-def _run(env: gym.Env[Any, Any], policy: Any, number: int, seed: int | None, deterministic: bool) -> EpisodeBuffer:
-    observation, info = env.reset(seed=seed)
-    if seed is not None:
-        env.action_space.seed(seed)  # for policies that sample it
-        if hasattr(policy, "set_random_seed"):  # for those that explore
-            policy.set_random_seed(seed)
-    episode = EpisodeBuilder(observation, info)
-    state: Any = None
-    first, done = np.ones(1, dtype=bool), False
-    while not done:
-        if hasattr(policy, "predict"):
-            action, state = policy.predict(observation, state=state, episode_start=first, deterministic=deterministic)
-        else:
-            action = policy(observation)
-        first = np.zeros(1, dtype=bool)
-        action = np.asarray(action, dtype=env.action_space.dtype)
-        if not env.action_space.contains(action):
-            raise InvalidArgumentError(
-                f"policy, episode {number}, step {len(episode)}: action",
-                expected=f"an element of {env.action_space}",
-                actual=f"{action} of shape {action.shape}",
-            )
-        observation, reward, terminated, truncated, info = env.step(action)
-        episode.add(action, float(reward), observation, terminated=terminated, truncated=truncated, info=info)
-        done = terminated or truncated
-    return episode.finish()
 
 
 def dataset_from_arrays(

@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
-from mpcoffline.checks import check_integers
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.checks import check_integers, check_known, checked_seed
+from mpcoffline.errors import InvalidArgumentError
 
 TASKS = ("linear", "pendulum", "cartpole")
 
@@ -80,8 +80,7 @@ class Recipe:
         Raises:
             UnknownIdError: For any other name.
         """
-        if task not in TASKS:
-            raise UnknownIdError.of("task", str(task), TASKS)
+        check_known("task", task, TASKS)
         content = tomllib.loads(catalog_file(f"{task}.toml").read_text(encoding="utf-8"))
         environment, training = content["environment"], content["training"]
         hyperparameters = dict(training["hyperparameters"])
@@ -136,11 +135,13 @@ class Recipe:
             )
         if alpha is not None and alpha != self.alpha:
             suffix += self._alpha_suffix(alpha, explicit=dataset_id is not None)
+        seed = None if seed is None else checked_seed("seed", seed)
         if seed is not None and seed != self.seed:
-            check_integers(0, seed=seed)
             suffix += f"-seed{seed}"
-        if steps is not None and steps != self.steps:
+        if steps is not None:
             check_integers(1, steps=steps)
+            steps = int(steps)
+        if steps is not None and steps != self.steps:
             suffix += f"-steps{steps}"
         name, version = self.dataset_id.rsplit("-v", 1)
         return replace(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from copy import copy
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -12,14 +11,16 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
 from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 
 from .episodes import EpisodeBuilder
 from .minari_store import check_new_dataset
+from .plants import common_spec
 from .recording import Recording
+from .stage_cost import PlantInfo
+from .vec_watching import VecWatch
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -34,9 +35,12 @@ class MinariRecorder(BaseCallback):
     * observations before any normalisation by ``VecNormalize``, s+ of a finished episode from
       ``infos[i]["terminal_observation"]`` (a ``VecEnv`` has already reset by then);
     * actions in the environment's units, after exploration noise and clipping;
-    * reward = ``-info["cost"]`` in float64 where the environment gives its stage cost, since a ``VecEnv``
-      rounds rewards to float32 and training wrappers may have scaled them; else the reward itself;
-    * ``infos/cost (T+1, 1)`` and ``infos/state (T+1, nx)`` in float64 where the environment gives them.
+    * the reward that the plant paid, below wrappers that change it (``VecNormalize``, ``TransformReward``, ...;
+      environments in other processes cannot be looked into: there it is what the ``VecEnv`` gives);
+    * reward = ``-info["cost"]`` in float64 where that equals the plant's reward in float32, since a ``VecEnv`` rounds
+      rewards. Where it does not, the key means something else (a violated limit, as in safe RL): the reward counts,
+      which a warning says once;
+    * ``infos/cost (T+1, 1)`` where it counts, and ``infos/state (T+1, nx)`` where each step gives one, in float64.
       Row 0 is the reset's; it is NaN for an episode that was already under way when recording began.
 
     Termination and truncation stay apart. An episode that is unfinished when training ends is kept, its last
@@ -52,6 +56,8 @@ class MinariRecorder(BaseCallback):
         overwrite: Whether an existing data set of this id may be replaced (at the end of training).
         algorithm_name: Stored as metadata; the name of the algorithm's class by default.
         description: Stored as metadata.
+        cost_key: The key of ``info`` that *is* the stage cost, minus the plant's reward; by default ``"cost"``, where
+            it proves to be. A key that is named must be there and equal at each step.
         resume: False deletes what an interrupted recording of this id has left instead of continuing it.
         sync_episodes: Finished episodes of an environment after which the log is forced to the disk; between
             that, a lost power supply (not a killed process) can take them.
@@ -64,8 +70,10 @@ class MinariRecorder(BaseCallback):
 
     Raises:
         InvalidArgumentError: At construction for an id against Minari's grammar, or one that exists; at the
-            start of training for an on-policy algorithm, observations that are not a Box, another recorder at
-            work on this id, or an interrupted recording with other spaces.
+            start of training for an on-policy algorithm, observations that are not a Box, copies of an environment
+            with different arguments, another recorder at work on this id, or an interrupted recording with other
+            spaces; during training for a ``cost_key`` that is not there.
+        InvalidDataError: During training where ``cost_key`` is not minus the reward.
         StorageError: During training where the disk is full or fails; the episodes before are safe.
 
     Example:
@@ -79,6 +87,7 @@ class MinariRecorder(BaseCallback):
         overwrite: bool = False,
         algorithm_name: str | None = None,
         description: str | None = None,
+        cost_key: str | None = None,
         resume: bool = True,
         sync_episodes: int = 10,
         sync_seconds: float = 5.0,
@@ -91,15 +100,21 @@ class MinariRecorder(BaseCallback):
         self.overwrite = overwrite
         self.algorithm_name = algorithm_name
         self.description = description
+        self.cost_key = cost_key
         self.resume = resume
         self.sync_episodes, self.sync_seconds = sync_episodes, sync_seconds
         self.dataset: MinariDataset | None = None
         self.returns: list[float] = []
         self._running: list[EpisodeBuilder] = []
         self._recording: Recording | None = None
+        self._plants: VecWatch | None = None
+        self._rule = PlantInfo("MinariRecorder", cost_key)
 
     def close(self) -> None:
         """Lets go of the logs of a training that was interrupted, so that another recorder can continue them."""
+        if self._plants is not None:
+            self._plants.remove()
+            self._plants = None
         if self._recording is not None:
             self._recording.close()
             self._recording = None
@@ -107,13 +122,15 @@ class MinariRecorder(BaseCallback):
     def _on_training_start(self) -> None:
         agent = self._agent()
         self.close()
-        env_spec = _plain_spec(self.training_env.get_attr("spec")[0])
-        _warn_of_changed_spaces(self.training_env, env_spec)
+        env_spec = common_spec("MinariRecorder", self.training_env.get_attr("spec"))
+        plants = self._plants = VecWatch(self.training_env, "MinariRecorder")
+        self._rule = PlantInfo("MinariRecorder", self.cost_key)
+        _warn_of_changed_spaces(plants, env_spec)
         self._recording = Recording(
             self.dataset_id,
             env_spec=env_spec,
-            observation_space=self.training_env.observation_space,
-            action_space=self.training_env.action_space,
+            observation_space=plants.observation_space,
+            action_space=plants.action_space,
             # A second `learn` with this recorder extends the data set that it wrote itself.
             mode="extend" if self.dataset is not None else "replace" if self.overwrite else "new",
             algorithm_name=self.algorithm_name or type(self.model).__name__,
@@ -128,47 +145,40 @@ class MinariRecorder(BaseCallback):
                 f" {self.dataset_id!r} are continued; resume=False starts anew.",
                 stacklevel=2,
             )
-        observations = self._before(agent)
+        observations = plants.first_observations(self._before(agent))
         if agent.num_timesteps == 0:
-            infos = list(self.training_env.unwrapped.reset_infos)
+            infos = list(plants.reset_infos)
         else:
             # SB3 goes on in the middle of an episode: the reset infos belong to another state.
             infos = [builder.last_info for builder in self._running] or [{} for _ in observations]
-        self._running = [EpisodeBuilder(s, info) for s, info in zip(observations, infos, strict=True)]
+        self._running = [EpisodeBuilder(s, info, self._rule) for s, info in zip(observations, infos, strict=True)]
 
     def _on_step(self) -> bool:
-        agent, infos, dones = self._agent(), self.locals["infos"], self.locals["dones"]
-        recording = self._started()
-        normalizer = agent.get_vec_normalize_env()
-        reached: Any = self.locals["new_obs"] if normalizer is None else normalizer.get_original_obs()
-        for i, (info, done) in enumerate(zip(infos, dones, strict=True)):
-            next_observation = reached[i]
-            if done:
-                next_observation = info["terminal_observation"]
-                if normalizer is not None:
-                    # Back and forth through float64 and VecNormalize's clipping: SB3 keeps no original of it.
-                    back = normalizer.unnormalize_obs(next_observation)
-                    next_observation = np.asarray(back, dtype=reached.dtype)
+        recording, plants = self._started()
+        for i, (info, done) in enumerate(zip(plants.infos, plants.dones, strict=True)):
             truncated = bool(done) and bool(info.get("TimeLimit.truncated", False))
             self._running[i].add(
-                self.locals["actions"][i],
-                self.locals["rewards"][i],
-                next_observation,
+                plants.actions[i],
+                plants.rewards[i],
+                plants.terminal[i] if done else plants.observations[i],
                 terminated=bool(done) and not truncated,
                 truncated=truncated,
                 info=info,
+                given_reward=plants.given[i],
             )
             if done:
                 episode = self._running[i].finish()
                 self.returns.append(float(np.sum(episode.rewards)))
                 recording.append(i, episode, complete=True)
                 # Now, not at the next step: an episode of one step would overwrite the reset info.
-                self._running[i] = EpisodeBuilder(reached[i], self.training_env.unwrapped.reset_infos[i])
+                self._running[i] = EpisodeBuilder(plants.observations[i], plants.reset_infos[i], self._rule)
         recording.poll()
         return True
 
     def _on_training_end(self) -> None:
-        recording = self._started()
+        recording, plants = self._started()
+        plants.remove()
+        self._plants = None
         for i, builder in enumerate(self._running):
             if len(builder) > 0:
                 episode = builder.finish(truncate=True)
@@ -177,10 +187,10 @@ class MinariRecorder(BaseCallback):
         self.dataset = recording.seal()
         self._recording = None
 
-    def _started(self) -> Recording:
-        if self._recording is None:
+    def _started(self) -> tuple[Recording, VecWatch]:
+        if self._recording is None or self._plants is None:
             raise InvalidArgumentError("MinariRecorder", expected="a training that has started", actual="none")
-        return self._recording
+        return self._recording, self._plants
 
     def _agent(self) -> OffPolicyAlgorithm:
         if not isinstance(self.model, OffPolicyAlgorithm):
@@ -204,17 +214,7 @@ class MinariRecorder(BaseCallback):
         return np.array(before)
 
 
-def _plain_spec(spec: EnvSpec | None) -> EnvSpec | None:
-    """The spec without the training's wrappers and rendering; the time limit stays."""
-    if spec is None:
-        return None
-    plain = copy(spec)
-    plain.additional_wrappers = ()
-    plain.kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
-    return plain
-
-
-def _warn_of_changed_spaces(env: VecEnv, spec: EnvSpec | None) -> None:
+def _warn_of_changed_spaces(env: VecWatch, spec: EnvSpec | None) -> None:
     """Warns where a training wrapper changes what is recorded, so that the spec does not rebuild it."""
     if spec is None:
         return

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from mpcoffline.checks import check_integers, check_number
-from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
+from mpcoffline.checks import check_integers, check_known, check_number
+from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
 from mpcoffline.mpc import NetworkCost, QuadraticCost, TerminalCost
 from mpcoffline.mpc.networks import HIDDEN
 
@@ -119,8 +119,7 @@ def fit_terminal(
         InvalidDataError: If states or their values are not finite.
         MPCOfflineError: If the network does not learn V.
     """
-    if kind not in TERMINAL_KINDS:
-        raise UnknownIdError.of("terminal cost", kind, TERMINAL_KINDS)
+    check_known("terminal cost", kind, TERMINAL_KINDS)
     check_number("blend", blend, 0.0, 1.0, open_low=False)
     config = config or DistillConfig()
     reference = np.atleast_1d(np.asarray(x_ref, dtype=np.float64))

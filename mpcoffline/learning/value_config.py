@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mpcoffline.checks import check_integers, check_number
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.checks import check_integers, check_known, check_number
+from mpcoffline.errors import InvalidArgumentError
 
 from .value_methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
 
@@ -53,8 +53,7 @@ class ValueConfig:
     patience: int = 2_000
 
     def __post_init__(self) -> None:
-        if self.method not in VALUE_METHODS:
-            raise UnknownIdError.of("value method", self.method, VALUE_METHODS)
+        check_known("value method", self.method, VALUE_METHODS)
         if not 0.0 < self.tau < 1.0:
             raise InvalidArgumentError("tau", expected="a number in (0, 1)", actual=str(self.tau))
         check_integers(1, n_steps=self.n_steps, batch_size=self.batch_size, n_members=self.n_members)

@@ -8,7 +8,8 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.checks import check_known
+from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .ddp import CompilerError, DDPSolver
@@ -68,8 +69,7 @@ def check_solver(name: str, options: Mapping[str, Any]) -> None:
         UnknownIdError: For an unknown name.
         InvalidArgumentError: For an option that the solver has not, or a value out of range.
     """
-    if name != "auto" and name not in SOLVERS:
-        raise UnknownIdError.of("solver", name, ["auto", *SOLVERS])
+    check_known("solver", name, ["auto", *SOLVERS])
     known = _options(name) if name != "auto" else sorted({option for each in SOLVERS for option in _options(each)})
     if unknown := [option for option in options if option not in known]:
         kind = "the solvers" if name == "auto" else f"the {name} solver"

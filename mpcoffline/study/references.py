@@ -75,7 +75,7 @@ def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), di
     Raises:
         InvalidArgumentError: For another task.
     """
-    if task not in _SWING_UPS:
+    if not isinstance(task, str) or task not in _SWING_UPS:
         raise InvalidArgumentError("task", expected=f"one of {', '.join(_SWING_UPS)}", actual=repr(task))
     swing_up, states = _SWING_UPS[task], np.asarray(states, dtype=np.float64)
     solver = make_solver(_episode(swing_up, discount), "auto")
