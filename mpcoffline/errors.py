@@ -80,7 +80,7 @@ class StorageError(MPCOfflineError, OSError):
             path: The file or folder.
             error: The system's error.
         """
-        full = getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error)
+        limits = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        full = next((os.strerror(n) for n in limits if error.args[:1] == (n,) or os.strerror(n) in str(error)), None)
         hint = "Free some space, then run it again: what was written before is intact." if full else ""
-        actual = os.strerror(errno.ENOSPC) if full else str(error)
-        return cls(f"file {path}", expected="to be written", actual=actual, hint=hint)
+        return cls(f"file {path}", expected="to be written", actual=full or str(error), hint=hint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import errno
 import hashlib
@@ -29,6 +30,7 @@ from .ids import GRAMMAR, is_valid_id
 from .manifest import write_manifest
 from .opening import open_dataset, read_metadata
 from .recipes import TASKS, Recipe, catalog_file
+from .writing import store_episodes
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -243,6 +245,7 @@ def write_dataset(
     if first is None:
         raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
     target = dataset_path(dataset_id)
+    new_folders = [folder for folder in target.parents if not folder.exists()]
     metadata = {RECORDING: recording}
     scratch = ExitStack()
     try:
@@ -265,11 +268,12 @@ def write_dataset(
                 "algorithm_name": algorithm_name,
                 "description": description,
             }
-        storage.update_episodes(itertools.chain([first], iterator))
+        store_episodes(storage, itertools.chain([first], iterator), new=not extend)
         finish(building, {key: value for key, value in metadata.items() if value is not None})
         _declare_namespace(dataset_id)
         publish(building, target, overwrite=overwrite)
     except (OSError, RuntimeError) as error:
+        _undeclare_namespace(target, new_folders)
         if isinstance(error, MPCOfflineError) or (isinstance(error, OSError) and error.errno == errno.ENOTEMPTY):
             raise
         # h5py reports a full disk as either, and once more when it closes the file.
@@ -330,3 +334,14 @@ def _declare_namespace(dataset_id: str) -> None:
             # Another process declared it in the meantime; anything else is an error.
             if namespace not in list_local_namespaces():
                 raise
+
+
+def _undeclare_namespace(target: Path, new_folders: list[Path]) -> None:
+    """Removes the records that :func:`_declare_namespace` could not write, and the folders made for them."""
+    for folder in target.relative_to(dataset_path("")).parents:
+        record = dataset_path("") / folder / "namespace_metadata.json"
+        if record.exists() and (record.parent in new_folders or record.stat().st_size == 0):
+            record.unlink(missing_ok=True)
+        if record.parent in new_folders:
+            with contextlib.suppress(OSError):  # another process's data set has come into it
+                record.parent.rmdir()

@@ -10,6 +10,7 @@ machine's sine into a visibly different episode.
 from __future__ import annotations
 
 import itertools
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,10 +23,11 @@ from numpy.typing import NDArray
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.envs import ControlTask
-from mpcoffline.errors import FileFormatError, InvalidDataError
+from mpcoffline.errors import FileFormatError, InvalidDataError, StorageError
 
 from .hdf5_guard import check_hdf5
 from .minari_store import write_dataset
+from .writing import SteadyFile, write_steadily
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -48,6 +50,7 @@ def pack(dataset: MinariDataset, path: str | Path) -> None:
     Raises:
         InvalidDataError: Where the environment does not reproduce the recorded observations
             and rewards from states and actions: such a data set cannot be packed.
+        StorageError: Where the disk refuses; a file of that name is as it was.
     """
     name = f"data set {dataset.spec.dataset_id!r}"
     if dataset.env_spec is None:
@@ -61,18 +64,30 @@ def pack(dataset: MinariDataset, path: str | Path) -> None:
         actions.append(np.asarray(episode.actions, dtype=np.float32))
         terminated.append(bool(episode.terminations[-1]))
     metadata = dataset.storage.metadata
-    with h5py.File(path, "w") as file:
-        file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-        file.attrs["dataset_id"] = dataset.spec.dataset_id
-        file.attrs["env_spec"] = dataset.env_spec.to_json()
-        for key in ("algorithm_name", "description"):
-            file.attrs[key] = metadata.get(key, "")
-        # Shuffling puts the exponents of neighbours side by side, which is what can be compressed in float64.
-        layout: dict[str, Any] = {"compression": "gzip", "compression_opts": 9, "shuffle": True}
-        file.create_dataset("states", data=np.concatenate(states), **layout)
-        file.create_dataset("actions", data=np.concatenate(actions), **layout)
-        file.create_dataset("lengths", data=np.array([len(a) for a in actions], dtype=np.int32))
-        file.create_dataset("terminated", data=np.array(terminated))
+
+    def write(steady: SteadyFile) -> None:
+        with h5py.File(steady, "w") as file:
+            file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+            file.attrs["dataset_id"] = dataset.spec.dataset_id
+            file.attrs["env_spec"] = dataset.env_spec.to_json()
+            for key in ("algorithm_name", "description"):
+                file.attrs[key] = metadata.get(key, "")
+            # Shuffling puts the exponents of neighbours side by side, which is what can be compressed in float64.
+            layout: dict[str, Any] = {"compression": "gzip", "compression_opts": 9, "shuffle": True}
+            file.create_dataset("states", data=np.concatenate(states), **layout)
+            file.create_dataset("actions", data=np.concatenate(actions), **layout)
+            file.create_dataset("lengths", data=np.array([len(a) for a in actions], dtype=np.int32))
+            file.create_dataset("terminated", data=np.array(terminated))
+
+    new = Path(path).with_name(f".{Path(path).name}.{os.getpid()}")
+    try:
+        new.touch()
+        write_steadily(new, write)
+        new.replace(path)
+    except OSError as error:
+        raise StorageError.of(path, error) from error
+    finally:
+        new.unlink(missing_ok=True)
 
 
 def packed_size(path: str | Path) -> tuple[int, int]:

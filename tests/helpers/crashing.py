@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -83,6 +84,7 @@ def kill_at_call(number: int) -> None:
                 os.kill(os.getpid(), signal.SIGKILL)
 
     sys.setprofile(profile)
+    threading.setprofile(profile)  # HDF5 is written in a thread of its own
 
 
 def count_calls(job: Callable[[], None]) -> int:
@@ -94,10 +96,12 @@ def count_calls(job: Callable[[], None]) -> int:
         count += event == "c_call"
 
     sys.setprofile(profile)
+    threading.setprofile(profile)  # HDF5 is written in a thread of its own
     try:
         job()
     finally:
         sys.setprofile(None)
+        threading.setprofile(None)
     return count
 
 
