@@ -30,6 +30,10 @@ from mpcoffline.errors import FileFormatError, MPCOfflineError
 _VERSION = 1
 _DOCUMENT, _ARRAYS = "mpcoffline.json", "arrays.npz"
 _END = struct.Struct("<4s4H2LH")  # the last record of a zip: 22 bytes, and a comment, of which we write none
+_BOX_TYPES = (
+    *("float16", "float32", "float64", "bool"),
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal contents give equal bytes
 
 # What zipfile, zlib, json and numpy raise on damaged bytes; OSError and ValueError include their own classes.
@@ -214,23 +218,35 @@ def plain(value: Any) -> Any:
 
 
 def box_to_json(space: spaces.Box) -> dict[str, Any]:
-    """A one-dimensional Box space as JSON; infinite bounds become null."""
-    low, high = ([v if np.isfinite(v) else None for v in bound.tolist()] for bound in (space.low, space.high))
-    return {"low": low, "high": high, "dtype": str(space.dtype)}
+    """A one-dimensional Box space as JSON, of any type of number; bounds that are none become null."""
+    sides = ((space.low, space.bounded_below), (space.high, space.bounded_above))
+    low, high = (
+        [v if known else None for v, known in zip(bound.tolist(), bounded.tolist(), strict=True)]
+        for bound, bounded in sides
+    )
+    return {"low": low, "high": high, "dtype": space.dtype.name}
 
 
 def box_from_json(data: Mapping[str, Any]) -> spaces.Box:
     """The inverse of :func:`box_to_json`.
 
     Raises:
-        FileFormatError: For another type than a float, or bounds that cross.
+        FileFormatError: For another type than Box has, bounds that it cannot hold, or bounds that cross.
     """
     dtype = np.dtype(data["dtype"])
-    low, high = (
-        np.array([infinite if v is None else v for v in data[name]], dtype=np.float64)
-        for name, infinite in (("low", -np.inf), ("high", np.inf))
-    )
-    if dtype not in (np.float32, np.float64) or low.ndim != 1 or low.shape != high.shape or not (low <= high).all():
-        raise FileFormatError("space", expected="a Box of floats with low <= high", actual=str(dict(data)))
-    with np.errstate(over="ignore"):  # what float32 cannot hold is no bound
-        return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
+    if dtype.name not in _BOX_TYPES:
+        raise FileFormatError("space", expected=f"a Box of {', '.join(_BOX_TYPES)}", actual=str(dict(data)))
+    kinds, least, most = (float, int), -math.inf, math.inf
+    if dtype.kind in "iu":
+        kinds, least, most = (int,), int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+    elif dtype.kind == "b":
+        kinds, least, most = (bool,), False, True
+    bounds = [[none if v is None else v for v in data[name]] for name, none in (("low", least), ("high", most))]
+    fits = all(type(v) in kinds for side in bounds for v in side) and len(bounds[0]) == len(bounds[1])
+    if not fits or not all(least <= low <= high <= most for low, high in zip(*bounds, strict=True)):
+        raise FileFormatError("space", expected=f"a Box of {dtype} with low <= high", actual=str(dict(data)))
+    with np.errstate(over="ignore"):  # what a small type cannot hold is no bound
+        space = spaces.Box(*(np.array(side, dtype=dtype) for side in bounds), dtype=dtype.type)
+    space.bounded_below &= np.array([v is not None for v in data["low"]])
+    space.bounded_above &= np.array([v is not None for v in data["high"]])
+    return space

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
+import functools
 import hashlib
 import json
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
@@ -71,7 +72,6 @@ class Fit:
         InvalidArgumentError: For a device that this machine has not, or a V_phi of another discount than the fit's.
 
     Attributes:
-        learned: The MPC as far as it is learned; None before the first epoch of (FIT).
         value_function: V_phi, once it is learned.
         result: What (FIT) found, once it is done.
     """
@@ -94,7 +94,7 @@ class Fit:
         _check_device(device)
         self._nominal, self._mpc = nominal, restructured(nominal, config)
         _check_discount(value_function, self._mpc.discount)
-        self.learned: MPC | None = None
+        self._outcome: Callable[[], tuple[MPC, FitResult]] | None = None
         self.value_function = value_function
         self.result: FitResult | None = None
         self._total_step = 0
@@ -154,14 +154,26 @@ class Fit:
         training = ParameterTraining(self._mpc, value, table, self._groups, self._fit_config, seed=self._seed)
         self._begin("fit", training)
         phase, n_steps = f"(FIT) learning {'+'.join(self._groups)}", training.n_steps + 1
+
+        def outcome() -> tuple[MPC, FitResult]:
+            """What is handed out at this point of the training."""
+            result = training.finish()
+            mpc = self._with_terminal_cost(self._mpc.with_theta(result.theta), value, result, table)
+            return mpc, replace(result, theta=mpc.theta)
+
+        self._outcome = functools.cache(outcome)
         while not training.done:
             metrics = training.advance(epoch)
-            self.learned = self._mpc.with_theta(training.theta)
+            self._outcome = functools.cache(outcome)  # what is found once holds until the next step
             yield Epoch(phase, training.step, n_steps, self._total_step + training.step, metrics)
-        result = training.finish()
-        self.learned = self._with_terminal_cost(self._mpc.with_theta(result.theta), value, result, table)
-        self.result = replace(result, theta=self.learned.theta)
-        yield Epoch(phase, n_steps, n_steps, self._total_step + n_steps, {"fit_loss": result.loss_after})
+        self.result = self._outcome()[1]
+        yield Epoch(phase, n_steps, n_steps, self._total_step + n_steps, {"fit_loss": self.result.loss_after})
+
+    @property
+    def learned(self) -> Callable[[], MPC] | None:
+        """The MPC that would be handed out now, terminal cost and all, found when called; None before (FIT)."""
+        outcome = self._outcome
+        return None if outcome is None else lambda: outcome()[0]
 
     def _with_terminal_cost(self, mpc: MPC, value: ValueFunction, result: FitResult, table: TransitionTable) -> MPC:
         """The MPC with the terminal cost that the configuration asks for: T = V - Phi, or none from V."""

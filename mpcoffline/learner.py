@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 Learn = Literal["cost", "cost+model"]
 #: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
 Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
-#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False ends the fit there.
-Callback = Callable[["OfflineMPCLearner", int, int], bool | None]
+#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
+#: ends the fit there.
+Callback = Callable[["OfflineMPCLearner", int, int], Any]
 
 _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
 
@@ -100,7 +101,7 @@ class OfflineMPCLearner:
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
         self.history: History = []
-        self._mpc: MPC | None = None
+        self._mpc: MPC | Callable[[], MPC] | None = None  # while fitting, how to find it
         self._observation_space: spaces.Box | None = None
         self._policy: MPCPolicy | None = None
 
@@ -127,10 +128,10 @@ class OfflineMPCLearner:
             n_steps: Gradient steps of (VALUE), by far the longest part; the configuration's by default.
             n_steps_per_epoch: Steps between entries of the history; 500 in (VALUE) and 100 in (FIT) by default.
             evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
-                one of (FIT) on, when there is a policy.
+                one of (FIT) on, when there is a policy: the one that would be handed out if the fit ended there.
             callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch; one that returns
-                False ends the fit. :mod:`mpcoffline.loggers` has those that write CSV files and TensorBoard events,
-                :mod:`mpcoffline.sb3` one that runs SB3's.
+                False, also numpy's or torch's, ends the fit. :mod:`mpcoffline.loggers` has those that write CSV files
+                and TensorBoard events, :mod:`mpcoffline.sb3` one that runs SB3's.
             checkpoint: A file that is written at the end of each epoch. Where it exists, the fit goes on from it and
                 ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
@@ -202,21 +203,28 @@ class OfflineMPCLearner:
                 answers = [callback(self, len(history), epoch.total_step) for callback in callbacks]
                 progress.show(epoch)
                 yield history[-1]
-                if any(answer is False for answer in answers):
+                if any(_asks_to_end(answer) for answer in answers):
+                    self._mpc = self._found()  # which lets go of the data
                     return
+            self._mpc = self._found()
 
     @property
     def mpc(self) -> MPC:
-        """The learned MPC; a new object. While fitting, as far as it is learned.
+        """The learned MPC; a new object. While fitting, the one that would be handed out if the fit ended now.
 
         Raises:
-            MPCOfflineError: Before ``fit``.
+            MPCOfflineError: Before ``fit``, and in it before the first epoch of (FIT).
         """
-        if self._mpc is None:
+        found = self._found()
+        if found is None:
             raise MPCOfflineError(
                 "learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset)."
             )
-        return self._mpc
+        return found
+
+    def _found(self) -> MPC | None:
+        """The MPC; while fitting, its cost and its terminal cost take some seconds, once an epoch."""
+        return self._mpc if isinstance(self._mpc, MPC) or self._mpc is None else self._mpc()
 
     @property
     def theta(self) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -249,7 +257,7 @@ class OfflineMPCLearner:
         space = self._observation_space
         document = {
             "nominal": self.nominal_mpc.to_json(),
-            "learned": None if self._mpc is None else self._mpc.to_json(),
+            "learned": None if self._mpc is None else self.mpc.to_json(),
             "learn": self.learn,
             "preset": self.preset,
             "value_given": self._given_value_function is not None,
@@ -299,6 +307,14 @@ def policy_in(path: str | PathLike[str]) -> MPCPolicy:
         MPCOfflineError: For a learner that has not learned.
     """
     return OfflineMPCLearner.load(path).policy if holds(path, "learner") else MPCPolicy.load(path)
+
+
+def _asks_to_end(answer: Any) -> bool:
+    """Whether a callback's answer ends the fit: one that is false. None is no answer, nor are many of them at once."""
+    try:
+        return answer is not None and not answer
+    except (ValueError, RuntimeError):  # numpy's and torch's arrays of several
+        return False
 
 
 class _Progress:

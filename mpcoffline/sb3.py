@@ -269,7 +269,8 @@ class SB3Callback:
     """An SB3 callback (``EvalCallback``, ``CheckpointCallback``, ...) as a callback of ``fit``.
 
     It steps once at the end of each epoch from the first one of (FIT) on, when there is a policy, and sees an
-    :class:`MPCModel`: frequencies such as ``eval_freq`` count epochs, ``num_timesteps`` counts gradient steps.
+    :class:`MPCModel` of the MPC that ``fit`` would hand out if it ended there. Frequencies such as ``eval_freq`` count
+    epochs, ``num_timesteps`` counts gradient steps.
 
     Example:
         >>> best = EvalCallback(env, eval_freq=1, best_model_save_path="best")
@@ -300,11 +301,12 @@ class SB3Callback:
             self._model = self._started(learner, policy)
         self._model.set_policy(policy)
         self._model.num_timesteps = total_step
-        go_on = self._callback.on_step()
+        go_on = bool(self._callback.on_step())
         if not go_on:
             _log.info("%s ends the fit after epoch %d", type(self._callback).__name__, epoch)
         if learner.result is not None or not go_on:
             self._callback.on_training_end()
+            self._model = None  # another fit starts it anew
         return go_on
 
     def _started(self, learner: OfflineMPCLearner, policy: MPCPolicy) -> MPCModel:

@@ -25,6 +25,8 @@ _FEW_ROWS = 500
 _LITTLE_NOISE = 0.02  # where rows are few
 _COST_R2 = 0.9
 
+_UNDECIDED = "and {:.3g} times as much as on the best: models that disagree so much allow no recommendation"
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -79,8 +81,8 @@ class Comparison:
 
     @property
     def limit(self) -> float:
-        """The largest ratio of any member that may be recommended."""
-        return min(_WORST, 1.0 - _DISAGREEMENT * self.spread)
+        """The largest ratio of any member that may be recommended; 0, so none, where they disagree too much."""
+        return max(0.0, min(_WORST, 1.0 - _DISAGREEMENT * self.spread))
 
 
 def decide(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_rows: int) -> tuple[Verdict, tuple[str, ...]]:
@@ -119,9 +121,10 @@ def decide(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_rows: 
         doubts.insert(0, f"{first:.2f} times the cost of MPC_1 on the identified model is no clear gain: keep MPC_1.")
         return "keep MPC_1", tuple(doubts)
     if worst >= c.limit:
+        asked = f"where less than {c.limit:.2f} is asked for" if c.limit > 0.0 else _UNDECIDED.format(np.exp(c.spread))
         doubts.append(
             f"{first:.2f} times the cost of MPC_1 on the identified model, but {worst:.2f} times on the worst of"
-            f" {len(c.ratios)}, where less than {c.limit:.2f} is asked for: record more data where the models disagree."
+            f" {len(c.ratios)}, {asked}: record more data where the models disagree."
         )
     return ("keep MPC_1" if fewer[0] else "try with care"), tuple(doubts)
 
