@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mpcoffline.checks import check_integers
 from mpcoffline.envs import ControlTask
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.solvers.fallback import SolverStats, failures_in_words
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,8 @@ class Evaluation:
         discount: gamma of ``discounted_cost``.
         states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment gives none.
         actions: Actions applied, ``(T, nu)``.
+        n_solves: MPCs that the policy solved meanwhile; 0 for what is no MPC.
+        n_failures: Of them, those whose solution was not accepted at first; ``solver_stats`` says how they were answered.
     """
 
     cost: Array
@@ -52,11 +55,14 @@ class Evaluation:
     discount: float
     states: list[Array] = field(repr=False)
     actions: list[Array] = field(repr=False)
+    n_solves: int = 0
+    n_failures: int = 0
 
     def __str__(self) -> str:
+        failed = f", failed solves {failures_in_words(self.n_failures, self.n_solves)}" if self.n_solves else ""
         return (
             f"{len(self.cost)} episodes: cost {self.cost.mean():.1f} +- {self.cost.std():.1f}, "
-            f"discounted {self.discounted_cost.mean():.2f}, success {self.success.mean():.0%}"
+            f"discounted {self.discounted_cost.mean():.2f}, success {self.success.mean():.0%}{failed}"
         )
 
 
@@ -106,9 +112,17 @@ def evaluate(
     each = [options or {}] * n_episodes if options is None or isinstance(options, dict) else list(options)
     if len(each) != n_episodes:
         raise InvalidArgumentError("options", expected=f"{n_episodes} entries", actual=str(len(each)))
-    if spec.vector_entry_point and not spec.additional_wrappers and _is_our_task(spec):
-        return _evaluate_as_arrays(policy, spec, each, seed, discount)
-    return _evaluate_one_by_one(policy, spec, each, seed, discount)
+    as_arrays = spec.vector_entry_point and not spec.additional_wrappers and _is_our_task(spec)
+    before = _solves(policy)
+    result = (_evaluate_as_arrays if as_arrays else _evaluate_one_by_one)(policy, spec, each, seed, discount)
+    n_solves, n_failures = (int(n) for n in np.subtract(_solves(policy), before))
+    return replace(result, n_solves=n_solves, n_failures=n_failures)
+
+
+def _solves(policy: Predictor) -> tuple[int, int]:
+    """How many MPCs a policy, or the one in a model of SB3's, has solved, and how many of them failed."""
+    stats = getattr(policy, "solver_stats", None) or getattr(getattr(policy, "policy", None), "solver_stats", None)
+    return (stats.n_solves, stats.n_failures) if isinstance(stats, SolverStats) else (0, 0)
 
 
 def _evaluate_as_arrays(
