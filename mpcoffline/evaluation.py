@@ -45,7 +45,8 @@ class Evaluation:
         states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment gives none.
         actions: Actions applied, ``(T, nu)``.
         n_solves: MPCs that the policy solved meanwhile; 0 for what is no MPC.
-        n_failures: Of them, those whose solution was not accepted at first; ``solver_stats`` says how they were answered.
+        n_failures: Of them, those whose solution was not accepted at first; ``solver_stats`` of the policy says how
+            they were answered.
     """
 
     cost: Array
