@@ -170,6 +170,7 @@ def evaluate(
             {"policy": policy, "env": env, "episodes": episodes, "seed": seed, "start": start, "alpha": alpha}
             | _figures(result)
             | {"n_solves": stats.n_solves, "n_failures": stats.n_failures, "solve_time": stats.time / stats.n_solves}
+            | {"failures": stats.answers}
         )
         return
     table = Table(title=f"{policy.name} in {env}, {episodes} episodes", title_justify="left", box=None, pad_edge=False)
@@ -179,7 +180,7 @@ def evaluate(
         table.add_row(label, f"{costs.mean():.2f}", f"{costs.min():.2f}", f"{costs.max():.2f}")
     table.add_row("success", f"{result.success.mean():.0%}")
     table.add_row("time of a solve (ms)", f"{1e3 * stats.time / stats.n_solves:.2f}")
-    table.add_row("failed solves", f"{stats.n_failures} of {stats.n_solves}")
+    table.add_row("failed solves", stats.failures)
     console.print(table)
 
 

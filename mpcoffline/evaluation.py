@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -27,6 +27,7 @@ from mpcoffline.datasets.stage_cost import PlantInfo, number_of, reward_of
 from mpcoffline.datasets.watching import PlantWatch
 from mpcoffline.envs import ControlTask
 from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.solvers.fallback import SolverStats, failures_in_words
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,9 @@ class Evaluation:
         states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment does not
             give one at each step.
         actions: Actions applied, ``(T, nu)``.
+        n_solves: MPCs that the policy solved meanwhile; 0 for what is no MPC.
+        n_failures: Of them, those whose solution was not accepted at first; ``solver_stats`` of the policy says how
+            they were answered.
     """
 
     cost: Array
@@ -66,11 +70,14 @@ class Evaluation:
     discount: float
     states: list[Array] = field(repr=False)
     actions: list[Array] = field(repr=False)
+    n_solves: int = 0
+    n_failures: int = 0
 
     def __str__(self) -> str:
+        failed = f", failed solves {failures_in_words(self.n_failures, self.n_solves)}" if self.n_solves else ""
         return (
             f"{len(self.cost)} episodes: cost {self.cost.mean():.1f} +- {self.cost.std():.1f}, "
-            f"discounted {self.discounted_cost.mean():.2f}, success {self.success.mean():.0%}"
+            f"discounted {self.discounted_cost.mean():.2f}, success {self.success.mean():.0%}{failed}"
         )
 
 
@@ -133,21 +140,48 @@ def evaluate(
         if is_mpc(policy):
             check_units(given)
         actor, our_task = in_units(policy), isinstance(given.unwrapped, ControlTask)
+        known_cost = cost_key in (None, "cost")
         spec = rebuilt_spec(given) if given is env else without_window(given.spec) if given.spec is not None else None
     finally:
         if given is not env:
             given.close()
-    if spec is None:
-        episodes = _one_after_the_other(actor, given, each, first_seed, rule, cap)
-    elif our_task and spec.vector_entry_point and not spec.additional_wrappers and cost_key in (None, "cost"):
-        return _evaluate_as_arrays(actor, spec, each, first_seed, discount, cap)
+    before = _solves(policy)
+    if our_task and spec is not None and spec.vector_entry_point and not spec.additional_wrappers and known_cost:
+        result = _evaluate_as_arrays(actor, spec, each, first_seed, discount, cap)
     else:
-        episodes = [_Episode(gym.make(spec), first_seed + i, option, rule, i) for i, option in enumerate(each)]
-        try:
-            _step_together(actor, episodes, cap)
-        finally:
-            for episode in episodes:
-                episode.close()
+        result = _figures(_run(actor, given, spec, each, first_seed, rule, cap), rule, discount)
+    n_solves, n_failures = (int(n) for n in np.subtract(_solves(policy), before))
+    return replace(result, n_solves=n_solves, n_failures=n_failures)
+
+
+def _solves(policy: Predictor) -> tuple[int, int]:
+    """How many MPCs a policy, or the one in a model of SB3's, has solved, and how many of them failed."""
+    stats = getattr(policy, "solver_stats", None) or getattr(getattr(policy, "policy", None), "solver_stats", None)
+    return (stats.n_solves, stats.n_failures) if isinstance(stats, SolverStats) else (0, 0)
+
+
+def _run(
+    policy: Predictor,
+    given: gym.Env[Any, Any],
+    spec: EnvSpec | None,
+    options: Sequence[dict[str, Any]],
+    seed: int,
+    rule: PlantInfo,
+    cap: int,
+) -> list[_Episode]:
+    """The episodes: of copies that step together, or one after the other where no copy can be made."""
+    if spec is None:
+        return _one_after_the_other(policy, given, options, seed, rule, cap)
+    episodes = [_Episode(gym.make(spec), seed + i, option, rule, i) for i, option in enumerate(options)]
+    try:
+        _step_together(policy, episodes, cap)
+    finally:
+        for episode in episodes:
+            episode.close()
+    return episodes
+
+
+def _figures(episodes: Sequence[_Episode], rule: PlantInfo, discount: float) -> Evaluation:
     return Evaluation(
         cost=np.array([episode.costs.sum() for episode in episodes]),
         discounted_cost=np.array([discount ** np.arange(len(e.costs)) @ e.costs for e in episodes]),

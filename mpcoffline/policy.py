@@ -54,8 +54,8 @@ class MPCPolicy(BasePolicy):
         exploration_noise: sigma, a fraction of the action range; SB3's customary ``NormalActionNoise`` of 0.1 in
             actions scaled to [-1, 1] is 0.05 here.
         seed: Seeds the noise; :meth:`set_random_seed` starts it anew.
-        rescue: ``"ipopt"`` has ipopt try what the solver failed to solve, hundreds of times slower; its program is built
-            at the first failure. None, the default, for no rescue.
+        rescue: ``"ipopt"`` has ipopt try what the solver failed to solve, hundreds of times slower; its program is
+            built at the first failure. None, the default, for no rescue.
         rescue_time: Time that ipopt may take for a problem, in s, the building aside.
         **solver_options: Passed to the solver.
 

@@ -16,6 +16,7 @@ from mpcoffline.envs import ENV_IDS
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.evaluation import evaluate
 from mpcoffline.policy import MPCPolicy
+from mpcoffline.sb3 import MPCModel
 from mpcoffline.tasks import nominal_mpc
 
 Array = NDArray[np.float64]
@@ -257,6 +258,21 @@ def test_the_text_names_the_figures() -> None:
     result = evaluate(policy_for(gym.make(PENDULUM)), PENDULUM, 2)
     assert str(result).startswith(f"2 episodes: cost {result.cost.mean():.1f} +- ")
     assert f"discounted {result.discounted_cost.mean():.2f}, success 0%" in str(result)
+
+
+def test_failed_solves_are_counted_and_said() -> None:
+    """Of this evaluation alone, and of the policy in a model of SB3's too; what is no MPC has none."""
+    env = gym.make(PENDULUM)
+    policy = MPCPolicy(nominal_mpc(PENDULUM), "ddp", max_iterations=1)
+    policy.predict([1.0, 0.0, 0.0])
+    before = policy.solver_stats.n_failures
+    result = evaluate(policy, env, 1)
+    assert result.n_solves == result.length.sum()
+    assert 0 < result.n_failures == policy.solver_stats.n_failures - before
+    assert f"failed solves {result.n_failures} of {result.n_solves} (" in str(result)
+    assert f"n_failures={result.n_failures}" in repr(result)
+    assert evaluate(MPCModel(policy, env), env, 1).n_failures == result.n_failures
+    assert "failed" not in str(evaluate(Linear(3, 1, 1.0), env, 1))
 
 
 def test_a_vector_environment_is_refused_by_name() -> None:

@@ -134,7 +134,7 @@ def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
 
 
 def test_a_state_that_overflows_is_said_and_bounded(tmp_path: Path) -> None:
-    """The step returns 1 and an input within bounds."""
+    """The step returns that it has no plan, and an input within bounds."""
     export_c(MPCPolicy(nominal_mpc(PENDULUM)), tmp_path)
     (tmp_path / "main.c").write_text(
         MAIN.replace("return 2", 'printf("unsolved\\n")').replace("static mpc_state", "static mpc_state")

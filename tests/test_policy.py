@@ -339,18 +339,19 @@ def test_a_plan_of_another_horizon_is_refused(pendulum: MPCPolicy) -> None:
 def test_a_failed_solve_applies_the_previous_plan(recording: MPCPolicy, caplog: pytest.LogCaptureFixture) -> None:
     x = np.zeros((3, 2))
     _, state = recording.predict(x)
-    Recording.fail.update({1})
+    Recording.fail.update({0, 1})  # 0 too, as a retry is a batch of its own
     with caplog.at_level(logging.WARNING):
         actions, state = recording.predict(x, state=state)
-        np.testing.assert_allclose(actions[:, 0], [0.0, 1.1, 1.75])  # what the plan held; the others' own, clipped
+        np.testing.assert_allclose(actions[:, 0], [0.1, 1.1, 1.75])  # what the plan held; the other's own, clipped
         actions, state = recording.predict(x, state=state)
-        np.testing.assert_allclose(actions[:, 0], [0.0, 1.2, 1.75])
+        np.testing.assert_allclose(actions[:, 0], [0.2, 1.2, 1.75])
     assert state.known.all()
     assert [record.getMessage() for record in caplog.records] == [
         "An MPC was not solved (gave_up): applying the previous plan."
     ]
     stats = recording.solver_stats
-    assert (stats.n_solves, stats.n_failures, stats.iterations, stats.time) == (9, 2, 63, 1.5)
+    assert (stats.n_solves, stats.n_failures, stats.n_previous_plan) == (9, 4, 4)
+    assert (stats.iterations, stats.time) == (63 + 28, 2.5)  # the retries of two rows, twice
 
 
 @pytest.mark.parametrize(("low", "high", "expected"), [(-1.0, 1.0, 0.0), (0.5, 2.0, 0.5), (-2.0, -0.25, -0.25)])

@@ -113,6 +113,7 @@ def diagnose(
         lag=lag,
         noise=found.noise,
         goal_share=None if reference is None else goal_share(clean, reference),
+        failed_solves=(policies[0].solver_stats.failed_share, policies[1].solver_stats.failed_share),
         n_rows=len(table),
         n_episodes=table.n_episodes,
         traces=Traces(

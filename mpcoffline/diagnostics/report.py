@@ -82,6 +82,7 @@ class Report:
         lag: Whether inputs act late.
         noise: Measurement and process noise.
         goal_share: Share of the logged states near the reference; None without reference.
+        failed_solves: Share of the simulations' MPCs that were not solved at first: MPC_1's, the learned MPC's.
         n_rows: Transitions.
         n_episodes: Episodes.
         traces: What the figure shows besides; not in the JSON form.
@@ -101,6 +102,7 @@ class Report:
     lag: LagCheck
     noise: NoiseEstimate
     goal_share: float | None
+    failed_solves: tuple[float, float]
     n_rows: int
     n_episodes: int
     traces: Traces = field(repr=False, compare=False)
@@ -116,6 +118,7 @@ class Report:
             ("models, starts, steps", f"{len(ratios)}, {c.n_starts}, {c.n_steps}"),
             ("cost relative to MPC_1", f"{ratios[0]:.3f} identified, {ratios.min():.3f} to {ratios.max():.3f} all"),
             ("episodes that end well", f"{c.nominal_success[0]:.0%} MPC_1, {c.learned_success[0]:.0%} learned"),
+            ("failed solves", "{:.2%} MPC_1, {:.2%} learned".format(*self.failed_solves)),
             ("R2 of the simulated cost", f"{c.cost_r2:.4f}"),
             ("V against returns", self._value_text()),
             *((f"(FIT) error, {part.name}", f"{part.before:.3g} before, {part.after:.3g} after") for part in self.fit),

@@ -48,14 +48,21 @@ class SolverStats:
     n_zero: int = 0
 
     @property
-    def failures(self) -> str:
-        """In words, e.g. ``"3 of 200 (1.5 %): 1 solved from all starts, 2 answered by the best plan found"``."""
-        return failures_in_words(self.n_failures, self.n_solves) + self._answers()
+    def failed_share(self) -> float:
+        """Failures a problem; 0 before the first."""
+        return self.n_failures / self.n_solves if self.n_solves else 0.0
 
-    def _answers(self) -> str:
-        counts = {answer: getattr(self, answer.counter) for answer in _ANSWERS}
-        told = ", ".join(f"{count} {answer.told}" for answer, count in counts.items() if count)
-        return f": {told}" if told else ""
+    @property
+    def answers(self) -> dict[str, int]:
+        """How many failures each answer had, e.g. ``{"retried": 1, "best_plan": 2, ...}``."""
+        return {answer.counter.removeprefix("n_"): getattr(self, answer.counter) for answer in _ANSWERS}
+
+    @property
+    def failures(self) -> str:
+        """In words, e.g. ``"3 of 200 (1.5 %): 1 solved from all starts, 2 by the best plan found"``."""
+        counts = zip(_ANSWERS, self.answers.values(), strict=True)
+        told = ", ".join(f"{count} {answer.told}" for answer, count in counts if count)
+        return failures_in_words(self.n_failures, self.n_solves) + (f": {told}" if told else "")
 
     def count(self, solution: Solution) -> None:
         """Adds the work of a call."""
@@ -79,14 +86,16 @@ class _Answer:
 
 _RETRIED = _Answer("n_retried", "solved from all starts", "solved from all starts")
 _RESCUED = _Answer("n_rescued", "solved by ipopt", "solved by ipopt")
-_BEST = _Answer("n_best_plan", "answered by the best plan found", "applying the best plan found")
+_BEST = _Answer("n_best_plan", "by the best plan found", "applying the best plan found")
 _PREVIOUS = _Answer("n_previous_plan", "by the previous plan", "applying the previous plan")
 _ZERO = _Answer("n_zero", "by zero", "applying zero, within the bounds")
 _ANSWERS = (_RETRIED, _RESCUED, _BEST, _PREVIOUS, _ZERO)
 
 
 class Fallback:
-    """Answers the problems that a solver did not solve. In this order:
+    """Answers the problems that a solver did not solve.
+
+    In this order:
 
     1. *Retry*: a problem that was only tried from its plan is solved from all starts.
     2. *Rescue*, if wished: ipopt solves it, from the best plan found and from a start of its own.

@@ -48,8 +48,8 @@ def _ranges(mpc: MPC) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
     Where a bound is missing, nobody knows how large an input is. So the ranges of neighbouring candidates have sizes
     that are powers of ten apart, of which the rollouts choose. They are multiples of the largest number that is known
-    (the other bound, the input reference and its distance from that), or of 1 where all are zero, and begin at the other
-    bound, or lie around the reference.
+    (the other bound, the input reference and its distance from that), or of 1 where all are zero, and begin at the
+    other bound, or lie around the reference.
     """
     low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
     low, high = np.where(low > -_WIDE, low, -np.inf), np.where(high < _WIDE, high, np.inf)

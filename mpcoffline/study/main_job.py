@@ -14,7 +14,8 @@ from mpcoffline.evaluation import Evaluation, evaluate
 from mpcoffline.learner import Learn, OfflineMPCLearner
 from mpcoffline.mpc import MPC
 from mpcoffline.plotting import save_figure
-from mpcoffline.policy import MPCPolicy, SolverStats
+from mpcoffline.policy import MPCPolicy
+from mpcoffline.solvers.fallback import SolverStats
 
 from .figure import main_job_figure
 from .results import REFERENCE, ControllerResult, TaskResult

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mpcoffline.archive import file_errors
 from mpcoffline.errors import FileFormatError
+from mpcoffline.solvers.fallback import failures_in_words
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -137,7 +138,6 @@ class TaskResult:
 
     def notes(self) -> list[str]:
         """What one must know to read the table."""
-        failed = {c.name: c.n_failures for c in self.controllers if c.n_failures}
         return [
             *(f"{c.name}: {c.description}." for c in [*self.controllers, self.behaviour]),
             f"J: cost of an episode, mean; Jd: discounted with {self.discount:g}. rel.: the reference's cost over the"
@@ -145,8 +145,12 @@ class TaskResult:
             f"fit: time of the regressions; that of MPC_2 includes (VALUE, {self.value}), which MPC_3 shares.",
             "solve: mean time of one MPC in closed loop.",
             *self._costs_by_start(),
-            *(f"{name}: {n} solves failed and fell back to the previous plan." for name, n in failed.items()),
+            f"Failed solves: {self._failures() or 'none'}.",
         ]
+
+    def _failures(self) -> str:
+        told = [f"{c.name} {failures_in_words(c.n_failures, c.n_solves)}" for c in self.controllers if c.n_failures]
+        return ", ".join(told) + "; the best plan at hand was applied" if told else ""
 
     def _costs_by_start(self) -> list[str]:
         """J from each kind of start, where there are several: the agent's own episodes start broad, for example."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpc_problems import PENDULUM, random_linear
 
-from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
+from mpcoffline.solvers.starts import N_CANDIDATES, SIZES, candidate_inputs
 from mpcoffline.tasks import nominal_mpc
 
 
@@ -36,4 +36,7 @@ def test_unbounded_inputs_get_finite_sequences() -> None:
     mpc = random_linear(0, nu=2, action_low=[-np.inf, -1.0], action_high=[np.inf, np.inf])
     inputs = candidate_inputs(mpc)
     assert np.isfinite(inputs).all()
-    assert np.abs(inputs).max() <= 1.0
+    assert (inputs[..., 1] >= -1.0).all()
+    sizes = np.abs(inputs[..., 0]).max(axis=1)
+    for size in SIZES:  # nobody knows their unit: of each size there are some
+        assert ((sizes > 0.1 * size) & (sizes <= size)).any()

@@ -81,10 +81,12 @@ def test_rows_have_a_cell_a_column_and_leave_out_what_is_unknown(result: TaskRes
     assert [rows["behaviour"][name] for name in ("success", "rel. J", "solve (ms)")] == ["", "", ""]
 
 
-def test_notes_tell_of_failed_solves_where_there_were_any(result: TaskResult) -> None:
-    assert [note for note in result.notes() if "failed" in note] == [
-        "MPC_2: 3 solves failed and fell back to the previous plan."
-    ]
+def test_notes_count_failed_solves(result: TaskResult) -> None:
+    told = [note for note in result.notes() if "ailed" in note]
+    n = result.controller("MPC_2").n_solves
+    assert told == [f"Failed solves: MPC_2 3 of {n} ({300 / n:.2g} %); the best plan at hand was applied."]
+    good = replace(result, controllers=[replace(c, n_failures=0) for c in result.controllers])
+    assert "Failed solves: none." in good.notes()
 
 
 def test_notes_split_the_cost_by_kind_of_start(result: TaskResult) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from importlib import resources
 
 import casadi as ca
@@ -50,6 +51,7 @@ _FORMATS = {
 # GCC's effort grows with the square of a function's length. Only functions of costs that are networks are so long.
 _LONGEST = 2500
 _PIECE = 500
+_LARGEST_BENT = 5000  # nodes of a model whose second derivatives are taken; those of networks would take minutes
 # Inlined, the time of a cart-pole's expansion depends on where the linker puts it, by a quarter.
 _ATTRIBUTES = {"gen_q": "NOINLINE "}
 
@@ -92,15 +94,18 @@ def generated(mpc: MPC) -> str:
         "gen_final": _stacked(final),
         "gen_final_expand": _stacked(final_gradient, _triangle(final_hessian)),
     }
-    if not promises_convexity(mpc.stage_cost):  # then gen_q takes the expansion as the kernel changed it
+    exact = not hessian[: mpc.nx, : mpc.nx].nnz() and ca.n_nodes(reached) <= _LARGEST_BENT
+    as_is = exact or promises_convexity(mpc.stage_cost)
+    if not as_is:  # gen_q takes the expansion as the kernel changed it
         inputs["gen_stage_expand"], outputs["gen_stage_expand"] = [x, u], _stacked(slope, _triangle(hessian))
         stage = ca.SX.sym("stage", outputs["gen_stage_expand"].numel())
         inputs["gen_q"].append(stage)
         slope, hessian = stage[: mpc.nx + mpc.nu], _symmetric(stage[mpc.nx + mpc.nu :], mpc.nx + mpc.nu)
-    outputs["gen_q"] = _action_value(*linearised, slope, hessian, following, gradient, curvature, discount)
+    bent = _bent(reached, z) if exact else None
+    outputs["gen_q"] = _action_value(*linearised, slope, hessian, following, gradient, curvature, discount, bent)
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
-    convex = int(promises_convexity(mpc.stage_cost)), int(promises_convexity(mpc.terminal_cost))
+    convex = int(as_is), int(promises_convexity(mpc.terminal_cost))
     parts = [
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
@@ -122,13 +127,14 @@ def _action_value(
     gradient: ca.SX,
     curvature: ca.SX,
     discount: ca.SX,
+    bent: Callable[[ca.SX], ca.SX] | None,
 ) -> ca.SX:
     """The quadratic model of Q(x, u) = L + gamma V(f(x, u)), V expanded at the successor that the trajectory names.
 
     f is given by its value and Jacobian, L by its gradient and Hessian, all with respect to (x, u).
 
-    Gauss-Newton: the curvature of f is left out. In the order that the kernel expects: the defect, Qx, Qu, Qxx (upper
-    triangle), Qux, Quu.
+    Gauss-Newton: the curvature of f is left out, unless ``bent`` gives it. In the order that the kernel expects: the
+    defect, Qx, Qu, Qxx (upper triangle), Qux, Quu.
     """
     nx = reached.numel()
     discounted = _symmetric(discount * curvature, nx)
@@ -138,6 +144,9 @@ def _action_value(
     defect = reached - following
     slope = discount * gradient + discounted @ defect
     weighted_fx, weighted_fu = discounted @ fx, discounted @ fu
+    if bent is not None:
+        model = bent(slope)
+        lxx, lux, luu = lxx + model[:nx, :nx], lux + model[nx:, :nx], luu + model[nx:, nx:]
     return _stacked(
         defect,
         lx + fx.T @ slope,
@@ -146,6 +155,17 @@ def _action_value(
         lux + fu.T @ weighted_fx,
         luu + fu.T @ weighted_fu,
     )
+
+
+def _bent(reached: ca.SX, z: ca.SX) -> Callable[[ca.SX], ca.SX]:
+    """The Hessian of y'f by (x, u), for a column y.
+
+    Where the stage cost is linear in the states (prices), the curvature of f is all that there is inland of the bounds:
+    without it no step ends in a minimum.
+    """
+    y = ca.SX.sym("y", reached.numel())
+    hessian, _ = ca.hessian(ca.dot(y, reached), z)
+    return lambda slope: ca.substitute(hessian, y, slope)
 
 
 def _triangle(matrix: ca.SX) -> ca.SX:

@@ -13,8 +13,9 @@
  *   gen_final(x, p, out):      T [1]
  *   gen_final_expand(x, p, out): Tx [NX], Txx [NT]
  * with matrices column-major, and Vxx, Qxx, Txx and the Hessian of L as upper triangles column by column
- * (NT = NX (NX + 1) / 2, NZ = NX + NU); and STAGE_CONVEX, TERMINAL_CONVEX: whether L, T are convex for any theta. Of
- * those that are not, the positive semidefinite part of the Hessian is used.
+ * (NT = NX (NX + 1) / 2, NZ = NX + NU); and STAGE_CONVEX, TERMINAL_CONVEX: whether L, T are convex for any theta, or L is
+ * to be taken as it is, with the curvature of f: then Quu need not be positive definite, and steps are regularised until
+ * it is. Of those that are neither, the positive semidefinite part of the Hessian is used.
  *
  * Nothing here knows how many lanes there are: vd is one double or a vector of them, vl the result of comparing them.
  *

@@ -65,12 +65,16 @@ class DDPSolver(Solver):
 
     Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
     and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. Costs whose
-    class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian.
+    class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian; stage costs that
+    are linear in the states (prices) with the curvature of the model besides, as they have none of their own.
 
     A cold problem is solved from 16 of 64 fixed input sequences, each the cheapest of four that are alike; the best
     four of different costs go on after three iterations, and the best solution is kept. A warm one is solved from its
     plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
+    Otherwise it is the best plan found, and ``status`` says why it was not accepted: ``"iteration limit"``,
+    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one; most often a kink: ``fmax``,
+    ``fabs``, ``if_else``), or ``"not finite"``.
 
     References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 
