@@ -70,7 +70,7 @@ def clean(
 
 @app.command(epilog=examples("mpcoffline doctor", "mpcoffline doctor --json > doctor.json"))
 def doctor(as_json: Json = False) -> None:
-    """Check this installation: versions, C compiler, solvers, data sets, GPU, threads. Put it into bug reports.
+    """Check this installation: versions, C compiler, cache, solvers, data sets, GPU, threads. Put it into bug reports.
 
     Exit code 1 if something that is needed is broken.
     """
