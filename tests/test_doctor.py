@@ -45,6 +45,7 @@ def only(monkeypatch: pytest.MonkeyPatch, *examinations: str) -> None:
 def test_without_a_compiler_it_warns_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     only(monkeypatch, "_compiler", "_solvers")
     monkeypatch.setenv("CC", "/nowhere/cc")
+    monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == 0
@@ -60,9 +61,31 @@ def test_a_compiler_that_fails_is_found_out(monkeypatch: pytest.MonkeyPatch, tmp
     broken.write_text("#!/bin/sh\necho no licence >&2\nexit 3\n")
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
-    check = by_name(doctor.diagnosis())["C compiler"]
-    assert check["status"] == "warn"
-    assert "no licence" in check["found"]
+    first, second = doctor.diagnosis()["checks"]
+    assert first["status"] == "warn"
+    assert "no licence" in first["found"]
+    assert (second["name"], second["status"]) == ("C compiler", "ok")  # which takes its place
+
+
+@pytest.mark.parametrize("kind", ["absent", "there", "shared", "file"])
+def test_the_cache_with_its_size_and_whether_it_is_usable(
+    kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    only(monkeypatch, "_cache")
+    monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("MPCOFFLINE_CACHE_SIZE", "3 GB")
+    if kind == "file":
+        (tmp_path / "cache").write_text("in the way")
+    elif kind != "absent":
+        (tmp_path / "cache" / "tables").mkdir(parents=True)
+        (tmp_path / "cache").chmod(0o777 if kind == "shared" else 0o700)
+        (tmp_path / "cache" / "tables" / "rows").write_bytes(bytes(5_000_000))
+    (check,) = doctor.diagnosis()["checks"]
+    size = 5 if kind in ("there", "shared") else 0
+    assert check["found"].startswith(f"{tmp_path}/cache, {size} MB of at most 3000")
+    assert check["status"] == ("ok" if kind in ("absent", "there") else "warn")
+    expected = {"shared": "it can be written by others", "file": "it is no folder"}
+    assert check["found"].endswith(expected.get(kind, "of at most 3000"))
 
 
 def test_a_missing_needed_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .cleaning import CleaningReport, Waste, clean
     from .collection import collect
     from .hub import download_dataset, upload_dataset
     from .interop import to_d3rlpy, to_dict, to_sb3_replay_buffer, to_torchrl
@@ -19,12 +20,15 @@ if TYPE_CHECKING:
     from .verification import VerifyReport, verify
 
 __all__ = [
+    "CleaningReport",
     "MinariRecorder",
     "RepairReport",
     "ReplayReport",
     "Summary",
     "TransitionTable",
     "VerifyReport",
+    "Waste",
+    "clean",
     "collect",
     "dataset_from_arrays",
     "download_dataset",
@@ -45,12 +49,15 @@ __all__ = [
 
 # Loaded when first used: the recorder needs Stable-Baselines3 and with it torch, seconds of importing.
 _HOMES = {
+    "CleaningReport": "cleaning",
     "MinariRecorder": "recorder",
     "RepairReport": "repairing",
     "ReplayReport": "replaying",
     "Summary": "summary",
     "TransitionTable": "transitions",
     "VerifyReport": "verification",
+    "Waste": "cleaning",
+    "clean": "cleaning",
     "collect": "collection",
     "dataset_from_arrays": "logs",
     "download_dataset": "hub",

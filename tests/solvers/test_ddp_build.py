@@ -10,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compiling import STATE, compiler_script, libraries, tiny
 from mpc_problems import random_linear
 
-from mpcoffline.mpc import MPC, Model, NetworkCost, QuadraticCost
+from mpcoffline.mpc import Model, NetworkCost
 from mpcoffline.solvers import CompilerError, DDPSolver, make_solver
 from mpcoffline.solvers.ddp import build
 from mpcoffline.solvers.ddp.codegen import source
 from mpcoffline.tasks import nominal_mpc
-
-STATE = [[1.5]]
 
 
 @pytest.fixture(autouse=True)
@@ -26,24 +25,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of compiled solvers in an empty cache."""
     monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache" / "solvers"
-
-
-def tiny(weight: float = 1.0) -> MPC:
-    """x+ = x + u, N = 2: compiled in a second."""
-    model = Model(lambda x, u, p: x + u, 1, 1, 1.0, discrete=True)
-    return MPC(model, QuadraticCost([[weight]], [[1.0]]), QuadraticCost([[2.0]]), 2, 0.9, [-1.0], [1.0])
-
-
-def libraries(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.so"))
-
-
-def compiler_script(folder: Path, text: str) -> str:
-    """A program to be $CC."""
-    path = folder / "fake-cc"
-    path.write_text(text)
-    path.chmod(0o755)
-    return str(path)
 
 
 def test_a_solver_is_compiled_once(cache: Path) -> None:
@@ -166,9 +147,7 @@ def test_a_read_only_cache(cache: Path, caplog: pytest.LogCaptureFixture) -> Non
 
 
 SCRIPT = """
-import sys
-sys.path.insert(0, {folder!r})
-from test_ddp_build import STATE, tiny
+from compiling import STATE, tiny
 from mpcoffline.solvers import DDPSolver
 print(repr(float(DDPSolver(tiny()).value(STATE)[0])))
 """
@@ -177,7 +156,7 @@ print(repr(float(DDPSolver(tiny()).value(STATE)[0])))
 def child(tmp_path: Path, **environment: str) -> subprocess.Popen[str]:
     """A process that builds and uses the solver."""
     script = tmp_path / "child.py"
-    script.write_text(SCRIPT.format(folder=str(Path(__file__).parent)))
+    script.write_text(SCRIPT)
     helpers = Path(__file__).parent.parent / "helpers"
     env = os.environ | {"PYTHONPATH": str(helpers)} | environment
     return subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True)

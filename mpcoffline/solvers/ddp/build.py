@@ -154,7 +154,7 @@ def _compiled_by(compiler: str, source: str) -> ctypes.CDLL:
             try:
                 return _loaded(folder / name, name) or _built(compiler, flags, source, folder / name)
             except OSError as error:
-                failure = str(error)
+                failure = error.strerror or str(error)
                 warn_once(f"The cache folder {folder} cannot be used ({failure}).")
     except StorageError as error:
         failure = str(error)
