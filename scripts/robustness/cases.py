@@ -276,8 +276,8 @@ def findings(outcomes: list[Outcome]) -> list[str]:
             groups[outcome.name.rpartition("/")[0], outcome.kind, _short(outcome.detail)].append(outcome)
     lines = []
     for (place, kind, detail), group in sorted(groups.items()):
-        names = [outcome.name for outcome in (group if place == "hostile" else group[:1])]
-        mutation = "" if place == "hostile" else f" ({group[0].mutation})"
+        names = [outcome.name for outcome in (group if place.startswith("hostile") else group[:1])]
+        mutation = "" if place.startswith("hostile") else f" ({group[0].mutation})"
         lines.append(f"{place}: {kind}: {len(group)} x {detail}; `--only {' '.join(map(repr, names))}`{mutation}")
     return lines
 

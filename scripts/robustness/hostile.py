@@ -6,21 +6,22 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
-from . import hostile_archives, hostile_data, hostile_hdf5, hostile_places
+from . import hostile_archives, hostile_hdf5, hostile_places
 from .cases import Case
 from .honest import Honest
 from .targets import Read
 
-MODULES = (hostile_archives, hostile_data, hostile_hdf5, hostile_places)
+KINDS = {"archives": hostile_archives.FILES, "data sets": hostile_hdf5.FILES, "places": hostile_places.FILES}
 
 
 def all_cases(honest: Honest) -> list[Case]:
     """A case for each; 64 MB count as what an honest file takes."""
-    found: dict[str, Callable[[Honest, Path], Read]] = {}
-    for module in MODULES:
-        found |= module.FILES
 
     def make(function: Callable[[Honest, Path], Read]) -> Callable[[Path, random.Random], tuple[str, Read]]:
         return lambda folder, rng: ("by hand", function(honest, folder))
 
-    return [Case(f"hostile/{name}", make(function), 64 << 20) for name, function in found.items()]
+    return [
+        Case(f"hostile {kind}/{name}", make(function), 64 << 20)
+        for kind, files in KINDS.items()
+        for name, function in files.items()
+    ]
