@@ -1,0 +1,1 @@
+"""What scripts/attack_files and scripts/crash_recordings share."""

@@ -1,0 +1,135 @@
+"""Honest files of every kind that is read, small and made in seconds, and what they hold."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import gymnasium as gym
+import numpy as np
+
+import mpcoffline.envs  # noqa: F401 -- registers the environments
+from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable, nominal_mpc
+from mpcoffline.datasets import dataset_from_arrays, record, repair
+from mpcoffline.datasets.packed import pack
+
+ENV = "mpcoffline/LinearTracking-v0"
+SET, LOGS, PACKED = "aa/set-v0", "aa/logs-v0", "aa/packed-v0"
+EPISODES, STEPS = 6, 8
+FIT = {"value_n_steps": 12, "fit_n_steps": 6}
+
+
+@dataclass
+class Honest:
+    """A folder of honest files.
+
+    Attributes:
+        folder: ``policy.zip``, ``learner.zip``, ``fit.ckpt``, ``packed.h5``, ``other/`` (files of the same kinds with
+            other content), ``store/`` (a Minari store), ``tables/`` and ``solvers/`` (caches).
+        table: The rows of the data set.
+        rows: The rows of the episodes in the logs, as bytes.
+    """
+
+    folder: Path
+    table: TransitionTable
+    rows: set[bytes]
+
+
+@contextmanager
+def settings(**paths: Path | str) -> Any:
+    """Environment variables for a while."""
+    before = {key: os.environ.get(key) for key in paths}
+    os.environ.update({key: str(value) for key, value in paths.items()})
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            if value is None:
+                os.environ.pop(key, None)
+            else:
+                os.environ[key] = value
+
+
+def small_mpc(mass: float = 1.0) -> MPC:
+    """Three states and a name with a unit: quick to compile."""
+
+    def dynamics(x: Any, u: Any, p: Any) -> Any:
+        return ca.vertcat(x[1], x[2] + 0.1 * ca.sin(x[0]), u[0] / p["m"])
+
+    model = Model(dynamics, 3, 1, 0.1, {"m": Parameter(mass, low=0.1, unit="kg")})
+    return MPC(model, QuadraticCost(np.eye(3), [[0.1]]), QuadraticCost(np.eye(3)), 6, 0.95, [-1], [1])
+
+
+def learner() -> OfflineMPCLearner:
+    """A learner whose fit takes a second."""
+    return OfflineMPCLearner(nominal_mpc(ENV), preset="paper", seed=0, **FIT)
+
+
+def actions(seed: int) -> Any:
+    """A policy: random actions."""
+    rng = np.random.default_rng(seed)
+    return lambda observation: rng.uniform(-0.3, 0.3, 2).astype(np.float32)
+
+
+def short_env() -> gym.Env[Any, Any]:
+    """The linear task with short episodes."""
+    return gym.make(ENV, max_episode_steps=STEPS)
+
+
+def leave_logs(dataset_id: str, seed: int, episodes: int = EPISODES) -> None:
+    """A recording that is interrupted after some episodes."""
+    steps, policy = iter(range(episodes * STEPS)), actions(seed)
+
+    class InterruptionError(Exception):
+        pass
+
+    def interrupted(observation: Any) -> Any:
+        if next(steps, None) is None:
+            raise InterruptionError
+        return policy(observation)
+
+    with suppress(InterruptionError):
+        record(short_env(), interrupted, episodes + 1, dataset_id, seed=seed)
+
+
+def make_honest(folder: Path) -> Honest:
+    """Makes all of them."""
+    store = folder / "store"
+    (folder / "other").mkdir(parents=True)
+    store.mkdir()
+    x = np.array([0.3, 0.2, -0.1])
+    with settings(MINARI_DATASETS_PATH=store, MPCOFFLINE_CACHE=folder / "solvers"):
+        record(short_env(), actions(0), EPISODES, SET, seed=0)
+        table = TransitionTable.from_minari(SET)
+        TransitionTable.from_minari(SET, memory=1, cache=folder / "tables").statistics()
+        pack(__import__("minari").load_dataset(SET), folder / "packed.h5")
+        policy = MPCPolicy(small_mpc())
+        policy.predict(x)
+        policy.save(folder / "policy.zip")
+        MPCPolicy(small_mpc(2.0)).save(folder / "other" / "policy.zip")
+        fitted = learner()
+        fitted.fit(table, show_progress=False)
+        fitted.save(folder / "learner.zip")
+        stopped = learner()
+        stopped.fit(
+            table, n_steps_per_epoch=4, checkpoint=folder / "fit.ckpt", show_progress=False,
+            callbacks=[lambda owner, epoch, step: epoch < 2],
+        )  # fmt: skip
+        for number, place in ((1, store), (2, folder / "other")):
+            with settings(MINARI_DATASETS_PATH=place):
+                leave_logs(LOGS, number)
+        copy = folder / "sealed"
+        shutil.copytree(store, copy)
+        with settings(MINARI_DATASETS_PATH=copy):
+            repair(LOGS)
+            rows = {row.tobytes() for row in TransitionTable.from_minari(LOGS).rows}
+        with settings(MINARI_DATASETS_PATH=folder / "other"):
+            rng = np.random.default_rng(3)
+            episode = (rng.normal(size=(STEPS + 1, 4)), rng.normal(size=(STEPS, 2)), rng.normal(size=STEPS))
+            dataset_from_arrays(SET, [episode] * EPISODES)
+    return Honest(folder, table, rows)
