@@ -64,7 +64,7 @@ def check_limit(
 
 
 # Data sets: what is read of Minari's folders, of packed files and of table caches.
-METADATA_BYTES = 8 << 20  # of metadata.json; the bounds of a space of images take half a megabyte
+METADATA_BYTES = 4 << 20  # of metadata.json; the bounds of a space of images take half a megabyte
 MANIFEST_BYTES = 1 << 20  # of SHA256SUMS
 TABLE_META_BYTES = 16 << 20  # of a cached table's table.json: a terabyte of rows has that many checksums
 SPACE_ELEMENTS = 1_000_000  # of a space: the numbers of its bounds

@@ -145,10 +145,10 @@ class _Walk:
     def _declare(self, where: str, place: int) -> int:
         """Counts an array's bytes, each time that it is reached; returns its rows."""
         *shape, size = self._arrays[place]
-        self._bytes_left -= size
-        if self._bytes_left < 0:
+        if size > self._bytes_left:
             limit = EXPANSION_ALLOWANCE + EXPANSION * len(self._content)
             raise self._refused(where, f"arrays of at most {limit} bytes in a file of {len(self._content)}", "more")
+        self._bytes_left -= size
         return shape[0] if shape else -1
 
     # Groups

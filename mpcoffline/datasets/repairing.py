@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import h5py
 import numpy as np
 from gymnasium import spaces
@@ -115,7 +116,7 @@ def _repair_stored(dataset_id: str, env_spec: EnvSpec | None) -> RepairReport:
         _note_changes(dataset_id, notes)
         observed, acted = (_space(metadata, kind, file[good[0]], notes) for kind in ("observation", "action"))
         spec = _env_spec(metadata, notes) if env_spec is None else env_spec.to_json()
-        kept = metadata | {
+        kept = _kept(metadata, notes) | {
             "dataset_id": dataset_id,
             "minari_version": importlib.metadata.version("minari"),
             "data_format": "hdf5",
@@ -214,6 +215,9 @@ def _fault(group: Any) -> str:
     for key in _STEPS:
         lengths |= _lengths(group[key], key)
     infos = _lengths(group["infos"], "infos") if "infos" in group else {}
+    odd = [key for key in _STEPS[1:] if getattr(group[key], "dtype", np.dtype("O")).kind not in "fiub"]
+    if odd:
+        return f"{', '.join(odd)} that are no numbers"
     wrong = [key for key, n in lengths.items() if n != steps + key.startswith("observations")]
     wrong += [key for key, n in infos.items() if n != steps + 1]
     return f"unequal lengths of {', '.join(wrong)}" if wrong else "" if steps else "no step"
@@ -262,16 +266,36 @@ def _space(metadata: dict[str, Any], kind: str, group: Any, notes: list[str]) ->
     return str(serialize_space(spaces.Box(-np.inf, np.inf, values.shape[1:], values.dtype)))
 
 
+def _kept(metadata: dict[str, Any], notes: list[str]) -> dict[str, Any]:
+    """The entries of the metadata that Minari can read again."""
+    kept = dict(metadata)
+    for key in ("author", "author_email", "eval_env_spec"):
+        value = metadata.get(key)
+        good = isinstance(value, list) and all(isinstance(text, str) for text in value)
+        if key == "eval_env_spec":
+            good = value is None or _is_spec(value)
+        if key in kept and not good:
+            del kept[key]
+            notes.append(f"{key} is left out of the metadata: it cannot be read.")
+    return kept
+
+
+def _is_spec(text: object) -> bool:
+    try:
+        EnvSpec.from_json(str(text))
+    except (ValueError, TypeError, KeyError, AttributeError, gym.error.Error):
+        return False
+    return isinstance(text, str)
+
+
 def _env_spec(metadata: dict[str, Any], notes: list[str]) -> str | None:
     stored = metadata.get("env_spec")
     if stored is None and metadata:
         return None
-    try:
-        EnvSpec.from_json(str(stored))
+    if _is_spec(stored):
         return str(stored)
-    except (ValueError, TypeError, KeyError, AttributeError):
-        notes.append("The environment's spec is lost; repair(..., env_spec=...) can give it.")
-        return None
+    notes.append("The environment's spec is lost; repair(..., env_spec=...) can give it.")
+    return None
 
 
 def _is_intact(dataset_id: str) -> bool:
