@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mpcoffline.archive import read_archive
 from mpcoffline.checks import check_integers
+from mpcoffline.core.outputs import make_folder
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.learner import OfflineMPCLearner
 from mpcoffline.policy import MPCPolicy
@@ -165,7 +166,7 @@ class MPCModel(BaseAlgorithm):
             include: Accepted for SB3.
         """
         target = _with_suffix(Path(path))
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         self.policy.save(target)
 
     @classmethod

@@ -17,6 +17,7 @@ from typing import IO
 from mpcoffline.core.files import check_regular
 from mpcoffline.errors import FileFormatError, StorageError
 
+
 @contextmanager
 def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     """A new file that takes its name once it is complete and on the disk; until then, what was there stays.

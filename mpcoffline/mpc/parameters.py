@@ -95,7 +95,9 @@ class Block:
         for what, given, known in (("kind", self.kind, Kind), ("group", self.group, Group)):
             if given not in get_args(known):
                 raise InvalidArgumentError(
-                    f"{what} of {self.name}", expected=f"one of {', '.join(get_args(known))}", actual=repr(given)[:LONGEST]
+                    f"{what} of {self.name}",
+                    expected=f"one of {', '.join(get_args(known))}",
+                    actual=repr(given)[:LONGEST],
                 )
 
     @classmethod
