@@ -7,18 +7,22 @@ none; 130 interrupted by Ctrl-C. Results go to stdout, progress and messages to 
 from __future__ import annotations
 
 import difflib
+import io
 import json
+import sys
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import rich
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.segment import Segment
 from typer.core import TyperGroup
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError, visible
 
 if TYPE_CHECKING:
     from gymnasium import Env
@@ -29,8 +33,18 @@ if TYPE_CHECKING:
 USER_ERROR = 1
 INTERRUPTED = 130
 
-console = Console()
-messages = Console(stderr=True, soft_wrap=True, highlight=False)
+
+class SafeConsole(Console):
+    """A console on which no text steers the terminal, wherever it comes from: only styles do."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """What is shown, escape sequences in it made visible."""
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else visible(text), style, control)
+
+
+console = SafeConsole()
+messages = SafeConsole(stderr=True, soft_wrap=True, highlight=False)
 
 
 class Task(StrEnum):
@@ -87,6 +101,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, for
 
 class ErrorGroup(TyperGroup):
     """Shows what a user can do something about as one line, without traceback."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Prints what the terminal's character set lacks by its number."""
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
+        return super().main(*args, **kwargs)
 
     def invoke(self, ctx: Any) -> Any:
         """Runs a command; its error becomes a message and an exit code."""
@@ -183,7 +204,17 @@ def check_figure(option: str, path: Path) -> None:
         raise InvalidArgumentError(option, expected=f"a file ending in .{', .'.join(sorted(known))}", actual=str(path))
 
 
-def check_folder_of(option: str, path: Path) -> None:
-    """Refuses a file whose folder is missing: before the work, not after it."""
-    if not path.parent.is_dir():
+def check_out(option: str, path: Path, *, make: bool = False) -> None:
+    """Refuses a file that could not be written: before the work, not after it. ``make`` if its folder will be made."""
+    from mpcoffline.core.outputs import check_output
+
+    if not make and not path.parent.is_dir():
         raise InvalidArgumentError(option, expected="a file in a folder that exists", actual=str(path))
+    check_output(path, make=make)
+
+
+def check_out_folder(path: Path, *names: str) -> None:
+    """Refuses a folder in which these files could not be written: before the work, not after it."""
+    from mpcoffline.core.outputs import check_output_folder
+
+    check_output_folder(path, names)

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from mpcoffline.cli_common import Json, check_figure, console, examples, print_json, say
+from mpcoffline.cli_common import Json, check_figure, check_out, console, examples, print_json, say
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="The data sets on this machine.")
 
@@ -36,7 +36,7 @@ def list_(as_json: Json = False) -> None:
     for name in ("id", "where", "episodes", "transitions"):
         table.add_column(name, justify="right" if name in ("episodes", "transitions") else "left", no_wrap=True)
     for row in rows:
-        table.add_row(row.id, row.where, str(row.episodes), str(row.steps))
+        table.add_row(escape(row.id), row.where, str(row.episodes), str(row.steps))
     console.print(table)
 
 
@@ -56,6 +56,7 @@ def show(
 
     if figure is not None:
         check_figure("--figure", figure)
+        check_out("--figure", figure, make=True)
     summary = summarise(dataset_id, figure)
     if as_json:
         print_json(asdict(summary))

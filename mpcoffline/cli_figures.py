@@ -13,7 +13,8 @@ from mpcoffline.cli_common import (
     Json,
     LearnerFile,
     PlantAlpha,
-    check_folder_of,
+    check_out,
+    check_out_folder,
     examples,
     loaded_learner,
     made_environment,
@@ -34,6 +35,7 @@ app = typer.Typer()
 
 _BROAD_STARTS = 3
 _FILM_SECONDS = 5.0
+_FIGURES = ("training", "cost", "closed_loop", "phase_portrait")
 
 
 @app.command(
@@ -57,10 +59,11 @@ def diagnose(
     """
     from mpcoffline.datasets import load_dataset
     from mpcoffline.diagnostics import diagnose as examined
+    from mpcoffline.plotting.style import figure_files
 
+    for file in figure_files(out) if out is not None else ():
+        check_out("--out", file)
     fitted = loaded_learner(learner)
-    if out is not None:
-        check_folder_of("--out", out)
     data = load_dataset(dataset)
     with messages.status("Simulating both controllers on models of the log"):
         report = examined(fitted, data, seed=seed)
@@ -101,6 +104,7 @@ def plot(
     import mpcoffline
     from mpcoffline import MPCPolicy, plotting
 
+    check_out_folder(out, *(f"{stem}.{suffix}" for stem in _FIGURES for suffix in ("pdf", "png")))
     fitted = loaded_learner(learner)
     task = made_environment(env or _task_of(fitted), alpha, None)
     if film is not None:

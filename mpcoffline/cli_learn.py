@@ -21,7 +21,8 @@ from mpcoffline.cli_common import (
     Start,
     Task,
     ValueForm,
-    check_folder_of,
+    check_out,
+    check_out_folder,
     console,
     examples,
     loaded_policy,
@@ -103,10 +104,13 @@ def learn(
     """
     from mpcoffline.learner import OfflineMPCLearner
 
-    data, mpc = _data_and_mpc(task, dataset, alpha, seed)
-    for option, path in (("--out", out), ("--checkpoint", checkpoint), ("--log-csv", log_csv)):
+    policy_file = out.with_name(f"{out.stem}_policy{out.suffix}")
+    for option, path in (("--out", out), ("--out", policy_file), ("--checkpoint", checkpoint), ("--log-csv", log_csv)):
         if path is not None:
-            check_folder_of(option, path)
+            check_out(option, path)
+    if tensorboard is not None:
+        check_out_folder(tensorboard)
+    data, mpc = _data_and_mpc(task, dataset, alpha, seed)
     overrides: dict[str, Any] = {"discount": discount, "horizon": horizon}
     learner = OfflineMPCLearner(
         mpc,
@@ -125,7 +129,6 @@ def learn(
         raise
     seconds = time.perf_counter() - begin
     learner.save(out)
-    policy_file = out.with_name(f"{out.stem}_policy{out.suffix}")
     learner.policy.save(policy_file)
     if as_json:
         print_json({"learner": out, "policy": policy_file, "seconds": seconds} | _described(learner, data))
@@ -134,7 +137,7 @@ def learn(
     say_file("Learner", out)
     say_file("Policy", policy_file)
     env_id = data.spec.env_spec.id if data.spec.env_spec is not None else "ENV_ID"
-    say(f"Next: mpcoffline evaluate {escape(str(policy_file))} --env {env_id}")
+    say(f"Next: mpcoffline evaluate {escape(str(policy_file))} --env {escape(env_id)}")
     say(f"      mpcoffline diagnose {escape(str(out))} --dataset {escape(str(data.spec.dataset_id))}")
 
 
@@ -173,7 +176,8 @@ def evaluate(
             | {"failures": stats.answers}
         )
         return
-    table = Table(title=f"{policy.name} in {env}, {episodes} episodes", title_justify="left", box=None, pad_edge=False)
+    title = escape(f"{policy.name} in {env}, {episodes} episodes")
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for name in ("", "mean", "best", "worst"):
         table.add_column(name, justify="right" if name else "left")
     for label, costs in (("cost J", result.cost), (f"discounted cost ({result.discount:g})", result.discounted_cost)):
@@ -253,7 +257,7 @@ def _parameter_table(learner: OfflineMPCLearner) -> Table:
     for name in ("parameter", "nominal", "learned"):
         table.add_column(name)
     for name in dict.fromkeys([*before, *after]):
-        table.add_row(name, *(_shown(values.get(name)) for values in (before, after)))
+        table.add_row(escape(name), *(_shown(values.get(name)) for values in (before, after)))
     if learner.result is not None:
         table.add_row("regression error", f"{learner.result.loss_before:.4g}", f"{learner.result.loss_after:.4g}")
     return table

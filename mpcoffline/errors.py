@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 
 def visible(text: str) -> str:
-    """Text for a terminal: what would steer it (escape sequences, marks that reorder a line) is shown as ``\\x1b``.
+    """Text for a terminal: what would steer it (escape sequences, marks that reorder a line) is shown by its number.
 
     Line ends stay.
 

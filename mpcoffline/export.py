@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.core.outputs import check_output_folder, write_file
+from mpcoffline.core.text import c_comment, c_identifiers
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.learner import policy_in
 from mpcoffline.mpc import MPC
@@ -19,12 +21,13 @@ from mpcoffline.solvers.ddp.codegen import generated, text
 
 _log = logging.getLogger(__name__)
 
+_FILES = ("mpc_controller.h", "mpc_controller.c", "mpc_test.c", "test_vectors.txt", "CMakeLists.txt")
 _EPISODES, _STEPS = 4, 20
 # How a start of the test vectors is chosen, see _unambiguous_starts.
 _DRAWS = 40
 _NEARBY, _NEIGHBOURS = 0.05, 32  # how far from a start its neighbours are, and how many
 _ALIKE = 1e-3  # costs that differ by less, relative to 1 + |J|, are almost as good
-_SAME_PLAN = 1e-3  # inputs that differ by less, relative to 1 + |u|, are one plan: a minimum can be flat
+_SAME_PLAN = 1e-3  # inputs that differ by less, relative to their range, are one plan: a minimum can be flat
 
 
 def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str]) -> list[Path]:
@@ -46,7 +49,9 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
         InvalidArgumentError: For an MPC with constraints other than input bounds, or functions that C99 lacks.
         FileFormatError: If the file is damaged or foreign.
         CompilerError: If there is no working C compiler; the test vectors need one.
+        StorageError: If nothing could be written there, before anything is compiled.
     """
+    check_output_folder(folder, _FILES)
     if not isinstance(policy, MPCPolicy):
         policy = policy_in(policy)
     mpc = policy.mpc
@@ -56,22 +61,16 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
         )
     options = policy.solver_options if policy.solver_name == "ddp" else {}
     solver = DDPSolver(mpc, **options)
-    contents = {
-        "mpc_controller.h": _header(mpc, solver),
-        "mpc_controller.c": _source(mpc, solver),
-        "mpc_test.c": _TEST,
-        "test_vectors.txt": _vectors(MPCPolicy(mpc, "ddp", **options)),
-        "CMakeLists.txt": _CMAKE,
-    }
-    target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
-    for name, content in contents.items():
-        (target / name).write_text(content, encoding="utf-8")
-    return [target / name for name in contents]
+    rows = _vectors(MPCPolicy(mpc, "ddp", **options))
+    test = _TEST.replace("@RANGES@", ", ".join(map(_number, _ranges(mpc, rows))))
+    vectors = "".join(" ".join([str(int(reset)), *map(_number, row)]) + "\n" for reset, *row in rows)
+    texts = (_header(mpc, solver), _source(mpc, solver), test, vectors or "\n", _CMAKE)
+    contents = dict(zip(_FILES, texts, strict=True))
+    return [write_file(Path(folder) / name, content) for name, content in contents.items()]
 
 
 def _header(mpc: MPC, solver: DDPSolver) -> str:
-    fields = []
+    fields, identifiers = [], c_identifiers(block.name for block in mpc.space)
     for block in mpc.space:
         meaning = f"shape {block.shape}" if block.shape else "number"
         meaning += ", row by row" if len(block.shape) == 2 else ""
@@ -79,7 +78,8 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
             meaning = f"lower triangle, row by row, of C in {block.name} = C C', shape {block.shape}"
         size = f"[{block.size}]" if block.shape else ""
         unit = f", in {block.unit}" if block.unit else ""
-        fields.append(f"    double {_identifier(block.name)}{size}; /* {block.name}: {meaning}{unit} */")
+        comment = c_comment(f"{block.name}: {meaning}{unit}")
+        fields.append(f"    double {identifiers[block.name]}{size}; /* {comment} */")
     low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
     bounds = [f" *   u[{a}]: from {low[a]:g} to {high[a]:g}" for a in range(mpc.nu)]
     replaced = {
@@ -101,7 +101,7 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
     values = []
     for block in mpc.space:
         numbers = ", ".join(_number(v) for v in theta[mpc.space.slices[block.name]])
-        values.append(f"    {'{' + numbers + '}' if block.shape else numbers}, /* {block.name} */")
+        values.append(f"    {'{' + numbers + '}' if block.shape else numbers}, /* {c_comment(block.name)} */")
     segments = starts.candidate_inputs(mpc)[:, :: starts.SEGMENT]
     constants = [
         f"#define DISCOUNT {_number(mpc.discount)}",
@@ -120,10 +120,10 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
     return "\n\n".join([*parts, "\n".join(constants), text("controller.c")])
 
 
-def _vectors(policy: MPCPolicy) -> str:
+def _vectors(policy: MPCPolicy) -> list[list[float]]:
     """Closed loops on the policy's own model: per step 1 after a reset, the observation, the action."""
     mpc = policy.mpc
-    lines = []
+    rows: list[list[float]] = []
     for start in _unambiguous_starts(policy):
         y, state = start, None
         for step in range(_STEPS):
@@ -131,13 +131,21 @@ def _vectors(policy: MPCPolicy) -> str:
             if not solution.success:  # its action would say nothing
                 break
             state = solution.plan.shifted()
-            lines.append(" ".join([str(int(step == 0)), *(_number(v) for v in (*y, *solution.u0))]))
+            rows.append([float(step == 0), *y.tolist(), *solution.u0.tolist()])
             y = mpc.model(y, solution.u0)
-    if not lines:
+    if not rows:
         _log.warning(
             "No test vectors: of %d starts each was unsolved or had plans that are as good as its own.", _DRAWS
         )
-    return "\n".join(lines) + "\n"
+    return rows
+
+
+def _ranges(mpc: MPC, rows: list[list[float]]) -> NDArray[np.float64]:
+    """The range of each input that errors are measured by: never so large that no input at all would pass."""
+    width = np.asarray(mpc.action_high) - np.asarray(mpc.action_low)
+    largest = np.abs(np.array([row[-mpc.nu :] for row in rows])).max(axis=0) if rows else np.zeros(mpc.nu)
+    ranges = np.where(np.isfinite(width), np.minimum(width, 1e3 * largest), largest)
+    return np.where(ranges > 0.0, ranges, np.where(np.isfinite(width), width, 1.0))
 
 
 def _unambiguous_starts(policy: MPCPolicy) -> list[NDArray[np.float64]]:
@@ -148,21 +156,21 @@ def _unambiguous_starts(policy: MPCPolicy) -> list[NDArray[np.float64]]:
     """
     rng, shaking = np.random.default_rng(0), np.random.default_rng(1)
     found: list[NDArray[np.float64]] = []
+    width = np.asarray(policy.mpc.action_high) - np.asarray(policy.mpc.action_low)
     for _ in range(_DRAWS):
         y = rng.uniform(-1.0, 1.0, policy.mpc.nx)
         nearby = y + _NEARBY * shaking.uniform(-1.0, 1.0, (_NEIGHBOURS, len(y)))
         own = policy.solver.solve(y)
+        size = np.abs(own.u).max()
         others = policy.solver.solve(np.tile(y, (_NEIGHBOURS, 1)), warm_start=policy.solver.solve(nearby).plan)
         rivals = others.u[others.value < own.value + _ALIKE * (1.0 + abs(own.value))]
-        if own.success and np.all(np.abs(rivals - own.u) < _SAME_PLAN * (1.0 + np.abs(own.u).max())):
+        if own.success and np.all(
+            np.abs(rivals - own.u) < _SAME_PLAN * np.where(np.isfinite(width), width, 1.0 + size)
+        ):
             found.append(y)
         if len(found) == _EPISODES:
             break
     return found
-
-
-def _identifier(name: str) -> str:
-    return re.sub(r"\W", "_", name)
 
 
 def _number(value: float) -> str:
@@ -237,7 +245,8 @@ int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[
 """
 
 _TEST = """\
-/* Replays test_vectors.txt: mpc_test FILE. Returns 0 if every action is within 1e-6 (1 + |u|) of the expected one. */
+/* Replays test_vectors.txt: mpc_test FILE. Returns 0 if every action is within 1e-6 of the expected one, relative to
+ * the input's range: from its lower to its upper bound or, where it has none, up to the largest expected one. */
 #include <math.h>
 #include <stdio.h>
 
@@ -246,6 +255,7 @@ _TEST = """\
 int main(int argc, char **argv) {
     static mpc_state state;
     double y[MPC_NX], u[MPC_NU], expected, worst = 0.0;
+    const double range[MPC_NU] = {@RANGES@};
     int reset, steps = 0, unsolved = 0;
     FILE *file = fopen(argc > 1 ? argv[1] : "test_vectors.txt", "r");
     if (!file) {
@@ -259,7 +269,7 @@ int main(int argc, char **argv) {
         unsolved += mpc_step(&mpc_learned_parameters, &state, y, u) != 0;
         for (int a = 0; a < MPC_NU; ++a) {
             if (fscanf(file, "%lf", &expected) != 1) return 2;
-            double error = fabs(u[a] - expected) / (1.0 + fabs(expected));
+            double error = fabs(u[a] - expected) / range[a];
             if (!(error <= worst)) worst = error;
         }
         ++steps;

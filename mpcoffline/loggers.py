@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mpcoffline.core.outputs import check_output, check_output_folder, make_folder
 from mpcoffline.errors import MPCOfflineError
 
 if TYPE_CHECKING:
@@ -21,16 +22,20 @@ class CSVLogger:
 
     Args:
         path: The file; rows are added to one that exists, so that a resumed fit goes on in it.
+
+    Raises:
+        StorageError: If nothing could be written there.
     """
 
     COLUMNS = ("epoch", "total_step", "metric", "value")
 
     def __init__(self, path: str | PathLike[str]) -> None:
+        check_output(path, make=True)
         self._path = Path(path)
 
     def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:
         """Adds the rows of an epoch."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(self._path.parent)
         new = not self._path.exists()
         with self._path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -46,6 +51,7 @@ class TensorBoardLogger:
         folder: Where TensorBoard looks for events.
 
     Raises:
+        StorageError: If nothing could be written there.
         MPCOfflineError: If TensorBoard is not installed.
     """
 
@@ -59,6 +65,7 @@ class TensorBoardLogger:
                 actual=str(error),
                 hint='pip install "mpcoffline[tensorboard]"',
             ) from error
+        check_output_folder(folder)
         self._writer = SummaryWriter(str(folder))
 
     def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> None:

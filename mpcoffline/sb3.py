@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from mpcoffline.archive import read_archive
 from mpcoffline.checks import check_integers, checked_seed
+from mpcoffline.core.outputs import make_folder
 from mpcoffline.datasets.plants import check_spaces, made, opened
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.learner import OfflineMPCLearner
@@ -167,7 +168,7 @@ class MPCModel(BaseAlgorithm):
             include: Accepted for SB3.
         """
         target = _with_suffix(Path(path))
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         self.policy.save(target)
 
     @classmethod

@@ -137,9 +137,9 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(style.os, "replace", interrupted)
+    monkeypatch.setattr("mpcoffline.core.outputs.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        style.write_whole(target, b"new")
+        style.write_file(target, b"new")
     assert target.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target]
 

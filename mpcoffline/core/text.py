@@ -16,108 +16,16 @@ _SIGNS = frozenset(" _-.,^*/()[]+%°µ·0123456789⁰¹²³⁴⁵⁶⁷⁸⁹⁺
 _BLANK_LETTERS = frozenset("\u115f\u1160\u3164\uffa0")  # letters by their class, of which nothing is seen
 _ALPHABET = "letters, digits, blanks and _ - . , ^ * / ( ) [ ] + % ° µ · ² ³"
 # Of C99 to C23 and C++ to C++20.
-_KEYWORDS = frozenset(
-    [
-        "alignas",
-        "alignof",
-        "and",
-        "and_eq",
-        "asm",
-        "atomic_cancel",
-        "atomic_commit",
-        "atomic_noexcept",
-        "auto",
-        "bitand",
-        "bitor",
-        "bool",
-        "break",
-        "case",
-        "catch",
-        "char",
-        "char8_t",
-        "char16_t",
-        "char32_t",
-        "class",
-        "co_await",
-        "co_return",
-        "co_yield",
-        "compl",
-        "concept",
-        "const",
-        "const_cast",
-        "consteval",
-        "constexpr",
-        "constinit",
-        "continue",
-        "decltype",
-        "default",
-        "delete",
-        "do",
-        "double",
-        "dynamic_cast",
-        "else",
-        "enum",
-        "explicit",
-        "export",
-        "extern",
-        "false",
-        "float",
-        "for",
-        "friend",
-        "goto",
-        "if",
-        "inline",
-        "int",
-        "long",
-        "mutable",
-        "namespace",
-        "new",
-        "noexcept",
-        "not",
-        "not_eq",
-        "nullptr",
-        "operator",
-        "or",
-        "or_eq",
-        "private",
-        "protected",
-        "public",
-        "register",
-        "reinterpret_cast",
-        "requires",
-        "restrict",
-        "return",
-        "short",
-        "signed",
-        "sizeof",
-        "static",
-        "static_assert",
-        "static_cast",
-        "struct",
-        "switch",
-        "synchronized",
-        "template",
-        "this",
-        "thread_local",
-        "throw",
-        "true",
-        "try",
-        "typedef",
-        "typeid",
-        "typename",
-        "typeof",
-        "typeof_unqual",
-        "union",
-        "unsigned",
-        "using",
-        "virtual",
-        "void",
-        "volatile",
-        "wchar_t",
-        "while",
-        "xor",
-        "xor_eq",
-    ]
+_KEYWORD = re.compile(
+    "alignas|alignof|and|and_eq|asm|atomic_cancel|atomic_commit|atomic_noexcept|auto|bitand|"
+    "bitor|bool|break|case|catch|char|char8_t|char16_t|char32_t|class|co_await|co_return|"
+    "co_yield|compl|concept|const|const_cast|consteval|constexpr|constinit|continue|decltype|"
+    "default|delete|do|double|dynamic_cast|else|enum|explicit|export|extern|false|float|for|"
+    "friend|goto|if|inline|int|long|mutable|namespace|new|noexcept|not|not_eq|nullptr|"
+    "operator|or|or_eq|private|protected|public|register|reinterpret_cast|requires|restrict|"
+    "return|short|signed|sizeof|static|static_assert|static_cast|struct|switch|synchronized|"
+    "template|this|thread_local|throw|true|try|typedef|typeid|typename|typeof|typeof_unqual|"
+    "union|unsigned|using|virtual|void|volatile|wchar_t|while|xor|xor_eq"
 )
 
 
@@ -180,7 +88,7 @@ def c_identifiers(names: Iterable[str]) -> dict[str, str]:
     for name in sorted(names, key=lambda name: re.fullmatch(r"[A-Za-z0-9_.]+", name) is None):  # in order otherwise
         plain = "".join(c if c.isascii() else _spelled(c) for c in name)
         stem = re.sub(r"_+", "_", re.sub(r"\W", "_", plain, flags=re.ASCII)).strip("_") or "p"
-        if not stem[0].isalpha() or stem in _KEYWORDS:
+        if not stem[0].isalpha() or _KEYWORD.fullmatch(stem):
             stem = f"p_{stem}"
         identifier, k = stem, 2
         while identifier in taken:

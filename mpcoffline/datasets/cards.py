@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.core.outputs import write_file
+from mpcoffline.core.text import markdown
 from mpcoffline.envs import LinearTrackingEnv
 
 from .collection import DISCOUNT, AgentScore, return_curve
@@ -72,8 +75,7 @@ def write_card(dataset: MinariDataset, recipe: Recipe, scores: Sequence[AgentSco
     _save(return_figure(costs, scores), folder / f"{recipe.task}_returns.png")
     _save(coverage_figure(PANELS[recipe.task], states, actions), folder / f"{recipe.task}_coverage.png")
     card = folder / f"{recipe.task}.md"
-    card.write_text(_card_text(recipe, costs, states, actions, scores), encoding="utf-8")
-    return card
+    return write_file(card, _card_text(recipe, costs, states, actions, scores))
 
 
 def return_figure(costs: NDArray[np.float64], scores: Sequence[AgentScore]) -> Figure:
@@ -170,7 +172,9 @@ def _visited(dataset: MinariDataset) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 def _save(figure: Figure, path: Path) -> None:
     # No metadata: the same data give the same file.
-    figure.savefig(path, dpi=130, metadata={"Software": None})
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=130, metadata={"Software": None})
+    write_file(path, picture.getvalue())
 
 
 def _card_text(
@@ -197,7 +201,7 @@ def _card_text(
     coordinates = [f"s[{i}]" for i in range(states.shape[1])]
     parts = [
         f"# {recipe.dataset_id}",
-        recipe.description
+        markdown(recipe.description)
         + " Recorded raw: observations y and actions in their units, reward -L, the stage cost L and the state s in"
         " float64. No episode terminates; each is truncated after 100 steps.",
         "```python\nimport mpcoffline\n\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.core.outputs import check_output, write_file
+from mpcoffline.core.text import markdown, visible
 from mpcoffline.errors import InvalidDataError
 
 from .cards import PANELS, Axis, coverage_figure
@@ -63,7 +66,7 @@ class Summary:
     figure: Path | None
 
     def __str__(self) -> str:
-        facts = [f"* {key}: {value}" for key, value in self.facts.items()]
+        facts = [f"* {key}: {markdown(value)}" for key, value in self.facts.items()]
         rows = [_HEADER, ("---",) * len(_HEADER), *self._rows()]
         table = ["| " + " | ".join(row) + " |" for row in rows]
         lines = [self.card or f"# {self.dataset_id}\n", *facts, "", *table]
@@ -77,7 +80,7 @@ class Summary:
 
         facts = Table(box=None, show_header=False, pad_edge=False)
         for key, value in self.facts.items():
-            facts.add_row(Text(key, style="bold"), Text(value))
+            facts.add_row(Text(key, style="bold"), Text(visible(value)))
         table = Table(*_HEADER, box=None, pad_edge=False)
         for column in table.columns[1:]:
             column.justify = "right"
@@ -101,15 +104,19 @@ def show(dataset: MinariDataset | str, figure: str | Path | None = None) -> Summ
     Raises:
         UnknownIdError: For an unknown id.
         InvalidDataError: For observations or actions that are no vectors, or no step at all.
+        StorageError: If the plot could not be written there.
     """
+    if figure is not None:
+        check_output(figure, make=True)
     if isinstance(dataset, str):
         dataset = load_dataset(dataset)
     columns = _columns(dataset)
     path = None
     if figure is not None:
         path = Path(figure)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        coverage(dataset, columns).savefig(path, dpi=130)
+        picture = io.BytesIO()
+        coverage(dataset, columns).savefig(picture, format=path.suffix.lstrip(".").lower() or "png", dpi=130)
+        write_file(path, picture.getvalue())
     named = [
         (f"{key}[{i}]", columns[key][:, i]) for key in ("observation", "action") for i in range(columns[key].shape[1])
     ]

@@ -175,8 +175,7 @@ class Report:
         """
         from mpcoffline.plotting import save_figure
 
-        stem = Path(path)
-        return save_figure(self.plot(), stem.with_suffix("") if stem.suffix.lower() in (".pdf", ".png") else stem)
+        return save_figure(self.plot(), Path(path))
 
 
 def _item(text: str) -> str:

@@ -54,7 +54,8 @@ class Constraint:
         terminal: Whether it holds at the end of the horizon.
 
     Raises:
-        InvalidArgumentError: For a name that is empty or not of the alphabet of names, or a penalty that is negative or zero altogether.
+        InvalidArgumentError: For a name that is empty or not of the alphabet of names, or a penalty that is negative or
+            zero altogether.
     """
 
     function: ConstraintFunction | ca.Function

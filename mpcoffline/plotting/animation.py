@@ -16,10 +16,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpcoffline.core.outputs import check_output, write_file
 from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 
 from .panels import task_of
-from .style import OTHER, STYLES, stem_and_index, write_whole
+from .style import OTHER, STYLES, stem_and_index
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -62,6 +63,7 @@ def animate(
         InvalidArgumentError: For another suffix, no controllers, a number that is not positive, or an environment that
             is none of this package's.
         MPCOfflineError: If pygame, or for MP4 ffmpeg, is missing.
+        StorageError: If nothing can be written there.
     """
     target = Path(path)
     check_film(target)
@@ -76,7 +78,7 @@ def animate(
     pictures = [_beside(list(policies), moment, width) for moment in zip(*columns, strict=True)]
     duration = every * task.dt
     content = _gif(pictures, duration) if target.suffix == ".gif" else _mp4(pictures, duration)
-    return write_whole(target, content)
+    return write_file(target, content)
 
 
 def check_film(path: Path) -> None:
@@ -85,6 +87,7 @@ def check_film(path: Path) -> None:
     Raises:
         InvalidArgumentError: For another suffix than ``.gif`` and ``.mp4``.
         MPCOfflineError: If pygame, or for MP4 ffmpeg, is missing.
+        StorageError: If nothing could be written there.
     """
     if path.suffix not in _SUFFIXES:
         raise InvalidArgumentError("film", expected=f"a file ending in {' or '.join(_SUFFIXES)}", actual=str(path))
@@ -96,6 +99,7 @@ def check_film(path: Path) -> None:
         ) from error
     if path.suffix == ".mp4":
         _ffmpeg()
+    check_output(path, make=True)
 
 
 def _frames(

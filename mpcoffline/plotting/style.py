@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mpcoffline.core.outputs import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -97,38 +97,26 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
 
     Args:
         figure: The figure.
-        stem: Path without suffix.
+        stem: Path without suffix, or with one of these two.
 
     Returns:
         The two files.
+
+    Raises:
+        StorageError: If what is there is no file, or the disk or the file system refuses.
     """
-    files = []
-    for suffix, metadata in (("pdf", ("CreationDate", "Creator", "Producer")), ("png", ("Software",))):
+    files = figure_files(stem)
+    for file, metadata in zip(files, (("CreationDate", "Creator", "Producer"), ("Software",)), strict=True):
         content = io.BytesIO()
-        figure.savefig(content, format=suffix, dpi=_PNG_DPI, metadata=dict.fromkeys(metadata))
-        files.append(write_whole(stem.with_name(f"{stem.name}.{suffix}"), content.getvalue()))
+        figure.savefig(content, format=file.suffix[1:], dpi=_PNG_DPI, metadata=dict.fromkeys(metadata))
+        write_file(file, content.getvalue())
     return files
 
 
-def write_whole(path: Path, content: bytes) -> Path:
-    """Writes a file that is complete or not there: an interruption leaves what was there before.
-
-    Args:
-        path: The file; its folder is made where it is missing.
-        content: What it holds.
-
-    Returns:
-        The path.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    return path
+def figure_files(stem: Path) -> list[Path]:
+    """The files that :func:`save_figure` writes."""
+    bare = stem.with_suffix("") if stem.suffix.lower() in (".pdf", ".png") else stem
+    return [bare.with_name(f"{bare.name}.{suffix}") for suffix in ("pdf", "png")]
 
 
 def stem_and_index(name: str) -> tuple[str, str]:

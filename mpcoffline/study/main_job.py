@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from mpcoffline.checks import check_integers
+from mpcoffline.core.outputs import check_output_folder, make_folder
 from mpcoffline.datasets import TransitionTable, load_dataset
 from mpcoffline.evaluation import Evaluation, evaluate
 from mpcoffline.learner import Learn, OfflineMPCLearner
@@ -18,7 +19,7 @@ from mpcoffline.policy import MPCPolicy
 from mpcoffline.solvers.fallback import SolverStats
 
 from .figure import main_job_figure
-from .results import REFERENCE, ControllerResult, TaskResult
+from .results import REFERENCE, RESULTS, ControllerResult, TaskResult
 from .setups import Setup, setup_of
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ _LEARNED: dict[str, Learn] = {"MPC_2": "cost", "MPC_3": "cost+model"}
 _LAST_EPISODES = 50
 # Far from the seeds that a data set was recorded with: the starts of the comparison are not among those of the data.
 FIRST_START = 1_000_000
+OUTPUTS = (RESULTS, "results.md", "results.csv", "figure.pdf", "figure.png")
 
 
 def run_task(
@@ -72,19 +74,22 @@ def run_task(
         UnknownIdError: For an unknown task, data set or form of (VALUE).
         InvalidArgumentError: For a number out of range.
         InvalidDataError: For a data set that does not fit the task.
+        StorageError: If nothing could be written there, before anything is learned.
     """
     check_integers(1, n_episodes=n_episodes)
     setup = setup_of(task, alpha, seed)
     data = load_dataset(dataset or setup.dataset_id)
     options: dict[str, Any] = {"preset": "paper", "seed": seed, "value": value} | learner_options
     OfflineMPCLearner(setup.nominal, **options)  # refuses wrong options before a folder is made
-    # The folder is made before the work, so that nothing is computed in vain where it cannot be written.
-    folder = Path(output) / "controllers"
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(Path(output) / "controllers")
+    for place, names in ((Path(output), OUTPUTS), (folder, ())):  # nothing is computed in vain
+        check_output_folder(place, names)
 
     learners = _learn(setup.nominal, data, progress, **options)
     mpcs = {"MPC_1": setup.nominal} | {name: learner.mpc for name, (learner, _) in learners.items()}
     mpcs[REFERENCE] = setup.reference
+    # What says that the folder is complete goes first and comes last: no table beside another run's figure.
+    (Path(output) / RESULTS).unlink(missing_ok=True)
     for name, (learner, _) in learners.items():
         learner.save(folder / f"{name}_learner.zip")
     starts = setup.starts(n_episodes)
@@ -130,8 +135,8 @@ def run_task(
         ],
         behaviour=_behaviour(TransitionTable.from_minari(data), setup.nominal.discount),
     )
-    result.save(Path(output))
     save_figure(main_job_figure(result), Path(output) / "figure")
+    result.save(Path(output))
     return result
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from mpcoffline.core.outputs import check_output_folder, write_file
 from mpcoffline.errors import FileFormatError
 
-from .main_job import run_task
+from .main_job import OUTPUTS, run_task
 from .results import TaskResult
 from .setups import setup_of
 
@@ -35,9 +36,12 @@ def reproduce(
     Raises:
         UnknownIdError: If the linear task has no data set for this alpha.
         InvalidArgumentError: For a number out of range.
+        StorageError: If nothing could be written there, before the first task begins.
     """
     folder = Path(output)
     results: list[TaskResult] = []
+    for place in (folder, *(folder / task for task in TASKS)):
+        check_output_folder(place, OUTPUTS)
     for task in TASKS:
         result = _done(folder / task, task, alpha, seed, n_episodes)
         if result is None:
@@ -45,7 +49,7 @@ def reproduce(
                 task, alpha=alpha, seed=seed, n_episodes=n_episodes, output=folder / task, progress=progress
             )
         results.append(result)
-        (folder / "results.md").write_text(_page(results), encoding="utf-8")
+        write_file(folder / "results.md", _page(results))
         yield result
 
 

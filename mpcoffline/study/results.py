@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mpcoffline.archive import file_errors
+from mpcoffline.core.documents import read_json
+from mpcoffline.core.outputs import write_file
+from mpcoffline.core.text import markdown, markdown_code
 from mpcoffline.errors import FileFormatError
 from mpcoffline.solvers.fallback import failures_in_words
 
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 _FORMAT = "mpcoffline main job"
 _VERSION = 1
 REFERENCE = "reference"
+RESULTS = "results.json"  # what is written last: where it is, a run is complete
 
 
 @dataclass(frozen=True)
@@ -180,13 +184,18 @@ class TaskResult:
     def markdown(self) -> str:
         """The table and its notes in Markdown."""
         rows = self.rows()
-        lines = [list(rows[0]), ["---"] + ["--:"] * (len(rows[0]) - 1), *(list(row.values()) for row in rows)]
+        lines = [
+            list(rows[0]),
+            ["---"] + ["--:"] * (len(rows[0]) - 1),
+            *([*map(markdown, row.values())] for row in rows),
+        ]
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-        notes = "\n".join(f"* {note}" for note in self.notes())
-        return f"# {self.title}\n\n{table}\n\n{notes}\n\nData: `{self.dataset_id}`, environment `{self.env_id}`.\n"
+        notes = "\n".join(f"* {markdown(note)}" for note in self.notes())
+        ids = f"Data: {markdown_code(self.dataset_id)}, environment {markdown_code(self.env_id)}."
+        return f"# {markdown(self.title)}\n\n{table}\n\n{notes}\n\n{ids}\n"
 
     def save(self, folder: Path) -> list[Path]:
-        """Writes results.json (everything), results.md (table and notes) and results.csv (table).
+        """Writes results.md (table and notes), results.csv (table) and, last, results.json (everything).
 
         Args:
             folder: An existing folder.
@@ -200,13 +209,11 @@ class TaskResult:
         writer.writerows(self.rows())
         document = {"format": _FORMAT, "version": _VERSION} | asdict(self)
         contents = {
-            "results.json": json.dumps(document, indent=1) + "\n",
+            RESULTS: json.dumps(document, indent=1) + "\n",
             "results.md": self.markdown(),
             "results.csv": sheet.getvalue(),
         }
-        for name, text in contents.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        return [folder / name for name in contents]
+        return [write_file(folder / name, contents[name]) for name in (*list(contents)[1:], RESULTS)]
 
     @classmethod
     def load(cls, path: Path) -> TaskResult:
@@ -219,10 +226,12 @@ class TaskResult:
             FileFormatError: If it is damaged or another file.
         """
         with file_errors(path):
-            document = json.loads(path.read_text(encoding="utf-8"))
+            document = read_json(path)
             found = document.pop("format"), document.pop("version")
-            if found != (_FORMAT, _VERSION):
+            if found != (_FORMAT, _VERSION) or type(found[1]) is not int:  # True is equal to 1
                 raise FileFormatError(str(path), expected=f"{_FORMAT}, version {_VERSION}", actual=str(found))
             controllers = [ControllerResult(**c) for c in document.pop("controllers")]
             behaviour = ControllerResult(**document.pop("behaviour"))
-            return cls(controllers=controllers, behaviour=behaviour, **document)
+            result = cls(controllers=controllers, behaviour=behaviour, **document)
+            result.markdown()  # what it is made of fits together
+            return result

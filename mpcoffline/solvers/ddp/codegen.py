@@ -214,7 +214,7 @@ def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> 
     for k, start in enumerate(range(0, len(program), _PIECE)):
         lines = statements[start : start + _PIECE]
         pieces.append(
-            _function(f"{name}_{k}", f"{arguments}, vd *restrict w", lines, [*pointers, "out", "w"], "NOINLINE ")
+            _function(f"{name}_{k}", f"{arguments}, vd *RESTRICT w", lines, [*pointers, "out", "w"], "NOINLINE ")
         )
         calls.append(f"{name}_{k}({', '.join(pointers)}, out, w);")
     return "\n\n".join([*pieces, _function(name, arguments, [work, *calls], [])])

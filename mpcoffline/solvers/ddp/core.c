@@ -62,7 +62,7 @@ typedef struct {
 } lanes;
 
 static inline vl all_lanes(void) { return vd_le(V(0.0), V(0.0)); }
-static inline vl no_lanes(void) { return (vl){0}; }
+static inline vl no_lanes(void) { return vd_lt(V(0.0), V(0.0)); }
 
 static inline vd clip(vd a, vd low, vd high) { return vd_min(vd_max(a, low), high); }
 

@@ -1,4 +1,4 @@
-/* What core.c needs of vector.h, for one problem at a time in plain C99. Masks are 0 and -1. */
+/* What core.c needs of vector.h, for one problem at a time in plain C99, which is C++ too. Masks are 0 and -1. */
 #include <math.h>
 
 typedef double vd;
@@ -6,6 +6,11 @@ typedef int vl;
 
 #define V(a) ((vd)(a))
 #define NOINLINE
+#ifdef __cplusplus
+#define RESTRICT
+#else
+#define RESTRICT restrict
+#endif
 #define INLINE inline
 #define vl_any(mask) (mask)
 static inline vd vd_select(vl mask, vd a, vd b) { return mask ? a : b; }

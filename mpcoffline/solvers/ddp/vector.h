@@ -12,6 +12,7 @@
 typedef double vd __attribute__((vector_size(8 * LANES)));
 typedef long long vl __attribute__((vector_size(8 * LANES)));
 
+#define RESTRICT restrict
 #define NOINLINE __attribute__((noinline))
 #define INLINE inline __attribute__((always_inline))
 
