@@ -20,7 +20,7 @@ from .watching import PlantWatch, plant_of, wrappers_around
 Env = gym.Env[Any, Any]
 
 #: Steps after which an episode counts as one without end, in an environment without a limit of its own.
-MAX_EPISODE_STEPS = 100_000
+MAX_EPISODE_STEPS = 10_000
 
 
 def opened(env: object) -> Env:
