@@ -60,7 +60,9 @@ class Zero:
     def __init__(self, value: float = 0.0) -> None:
         self.value = value
 
-    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True) -> Any:
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
         return np.full((*np.shape(observation)[:-1], 1), self.value, np.float32), None
 
 
@@ -78,6 +80,13 @@ class HalfAction(gym.ActionWrapper[Any, Any, Any]):
         return np.asarray(0.5 * action, np.float32)
 
 
+class Tenth(gym.RewardWrapper[Any, Any]):
+    """Scales rewards."""
+
+    def reward(self, reward: Any) -> float:
+        return 0.1 * float(reward)
+
+
 class Plain(gym.Wrapper[Any, Any, Any, Any]):
     """Changes nothing, and cannot be rebuilt from a spec."""
 
@@ -89,3 +98,8 @@ class Twice(gym.Wrapper[Any, Any, Any, Any]):
         _, first, *_ = self.env.step(action)
         observation, second, *rest = self.env.step(action)
         return observation, float(first) + float(second), *rest
+
+
+def half_drift() -> gym.Env[Any, Any]:
+    """An entry point that wraps its plant."""
+    return HalfObservation(Drift())
