@@ -113,7 +113,7 @@ def evaluate(
         options: ``reset`` options, the same for all episodes or one a episode.
         cost_key: The key of ``info`` that *is* the stage cost, minus the plant's reward; by default ``"cost"``, where
             it proves to be. A key that is named must be there and equal at each step.
-        max_episode_steps: Steps after which an episode is one without end, an error; by default 100,000, or the
+        max_episode_steps: Steps after which an episode is one without end, an error; by default 10,000, or the
             environment's own limit where that is larger.
 
     Returns:

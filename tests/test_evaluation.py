@@ -249,9 +249,8 @@ def test_unknown_environments_are_refused_with_the_nearest(env_id: str, nearest:
         evaluate(Linear(3, 1, 2.0), env_id, 1)
 
 
-def test_an_environment_without_a_spec_is_refused() -> None:
-    with pytest.raises(InvalidArgumentError, match=r"env: expected an environment made by gym\.make"):
-        evaluate(Linear(1, 1, 1.0), Countdown(), 1)
+def test_an_environment_without_a_spec_is_stepped_itself() -> None:
+    assert evaluate(Linear(1, 1, 1.0), Countdown(), 3, seed=2).length.tolist() == [2, 3, 4]
 
 
 def test_the_text_names_the_figures() -> None:

@@ -20,7 +20,7 @@ from .watching import PlantWatch, plant_of, wrappers_around
 Env = gym.Env[Any, Any]
 
 #: Steps after which an episode counts as one without end, in an environment without a limit of its own.
-MAX_EPISODE_STEPS = 100_000
+MAX_EPISODE_STEPS = 10_000
 
 
 def opened(env: object) -> Env:
@@ -204,14 +204,30 @@ def in_units(policy: Any) -> Any:
     statistics = ask()
     if statistics is not None:
         return _Normalising(policy, statistics) if statistics.norm_obs else policy
-    original, seen = getattr(policy, "_last_original_obs", None), getattr(policy, "_last_obs", None)
-    if original is not None and seen is not None and not np.array_equal(original, seen):
+    if _lost_statistics(policy):
         warnings.warn(
             f"{type(policy).__name__}: the agent learned under VecNormalize and is without its statistics, so that it"
             " sees observations that are not normalised; agent.set_env(VecNormalize.load(path, venv)) gives them back.",
             stacklevel=3,
         )
     return policy
+
+
+def _lost_statistics(agent: Any) -> bool:
+    """Whether an SB3 agent that was loaded alone shows that it learned under ``VecNormalize``.
+
+    On-policy algorithms keep the original of the last observation then, and only then; the others always keep one, so
+    that only a last observation beyond its space tells.
+    """
+    original, seen, space = (
+        getattr(agent, name, None) for name in ("_last_original_obs", "_last_obs", "observation_space")
+    )
+    if original is None or not isinstance(space, spaces.Box):
+        return False
+    if not hasattr(agent, "replay_buffer_class"):
+        return True
+    inside = [bool(((rows >= space.low) & (rows <= space.high)).all()) for rows in (original, seen)]
+    return inside == [True, False]
 
 
 class _Normalising:

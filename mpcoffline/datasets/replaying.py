@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -10,42 +9,20 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from numpy.typing import NDArray
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.checks import check_integers
-from mpcoffline.envs import ControlTask
-from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
+from mpcoffline.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 
 from .minari_store import load_dataset
+from .rebuilding import without_window
+from .simulation import QUANTITIES, TOLERANCES, Deviation, Simulation
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from rich.console import RenderableType
 
     Env = gym.Env[Any, Any]
-
-QUANTITIES = ("observation", "state", "cost")
-# Relative to 1 + size, for one step: another machine's sine differs in the last bit of float64, and rounding to
-# float32 can turn that into one unit in its last place.
-TOLERANCES: Mapping[str, float] = {"observation": 1e-6, "state": 1e-10, "cost": 1e-10}
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """The largest difference between what was recorded and what the environment gives.
-
-    Attributes:
-        absolute: In the unit of the quantity; inf where one of the two is not finite.
-        relative: The same difference over 1 + size of what was recorded.
-        episode: Where; None where there is no difference.
-        step: The row of the episode's observations.
-    """
-
-    absolute: float = 0.0
-    relative: float = 0.0
-    episode: int | None = None
-    step: int | None = None
 
 
 @dataclass(frozen=True)
@@ -57,10 +34,10 @@ class ReplayReport:
         env_id: Gymnasium id of the environment.
         episodes: Number of episodes simulated.
         steps: Number of steps simulated.
-        free_run: Largest deviation of each of ``QUANTITIES`` over whole episodes: errors pile up along it, and a
-            chaotic or unstable plant makes much of the last bit.
+        free_run: Largest deviation of each of ``QUANTITIES`` that is recorded, over whole episodes: errors pile up
+            along it, and a chaotic or unstable plant makes much of the last bit.
         one_step: The same, each step from the recorded state; empty for an environment that is no
-            :class:`~mpcoffline.envs.ControlTask`.
+            :class:`~mpcoffline.envs.ControlTask`, and without recorded states.
         wrong_ends: Episodes that terminate where the recording does not, or the other way round.
         skipped: Episodes that could not be simulated, each with the reason.
         tolerances: What :attr:`ok` allows, relative to 1 + size.
@@ -141,14 +118,17 @@ def replay(
     tolerances: Mapping[str, float] | None = None,
     progress: bool = False,
 ) -> ReplayReport:
-    """Simulates episodes again, from their recorded first state with their recorded actions.
+    """Simulates episodes again, from their recorded first state, or else their seed, with their recorded actions.
+
+    The environment is made without a window. Data sets of other tools often have no states but the seed (and the
+    options) of each reset: these are simulated from it, and judged by whole episodes.
 
     Our environments are deterministic: on the machine that recorded, every number comes out the same bit for bit. On
     another machine (C library, instruction set) single steps agree to the tolerance, whole episodes of an unstable or
     chaotic plant need not; an angle at the seam of its range may come out on the other side of it.
 
     Args:
-        dataset: The data set or its id; ``infos/state`` must be recorded.
+        dataset: The data set or its id; ``infos/state`` or the seeds of the resets must be recorded.
         n_episodes: How many, spread evenly over the data set; None for all.
         allow_import: Whether an environment that is not registered may be imported from where the data set says.
         tolerances: Largest allowed deviation by name in ``QUANTITIES``, in place of ``TOLERANCES``.
@@ -156,8 +136,8 @@ def replay(
 
     Raises:
         UnknownIdError: For an unknown data set, or an environment that is neither registered nor may be imported.
-        InvalidDataError: Without ``infos/state`` or an environment, or where that takes no state to start from, or has
-            noise.
+        InvalidDataError: Without an environment; without ``infos/state`` and seeds; where the environment takes no
+            state to start from, or has noise, and there is no seed; or for observations that are no arrays.
         InvalidArgumentError: For ``n_episodes`` < 1 or an unknown quantity.
     """
     if n_episodes is not None:
@@ -168,12 +148,6 @@ def replay(
     if isinstance(dataset, str):
         dataset = load_dataset(dataset)
     env = recover_environment(dataset, allow_import=allow_import)
-    if isinstance(env.unwrapped, ControlTask) and env.unwrapped.noisy:
-        raise InvalidDataError(
-            f"data set {dataset.spec.dataset_id!r}",
-            expected="an environment without noise, which alone can be simulated again",
-            actual=f"{dataset.env_spec.id if dataset.env_spec else env} with process or measurement noise",
-        )
     indices = dataset.episode_indices
     if n_episodes is not None and n_episodes < len(indices):
         indices = indices[np.linspace(0, len(indices) - 1, n_episodes).round().astype(int)]
@@ -182,7 +156,7 @@ def replay(
         from rich.progress import track
 
         episodes = track(episodes, description="Simulating again", total=len(indices))
-    simulation = _Simulation(env, f"data set {dataset.spec.dataset_id!r}")
+    simulation = Simulation(env, dataset)
     try:
         for episode in episodes:
             simulation.run(episode)
@@ -193,8 +167,8 @@ def replay(
         env_id=env.spec.id if env.spec is not None else "",
         episodes=simulation.episodes,
         steps=simulation.steps,
-        free_run=simulation.free_run,
-        one_step=simulation.one_step,
+        free_run=simulation.compared(simulation.free_run),
+        one_step=simulation.compared(simulation.one_step),
         wrong_ends=tuple(simulation.wrong_ends),
         skipped=tuple(simulation.skipped),
         tolerances={**TOLERANCES, **(tolerances or {})},
@@ -221,7 +195,7 @@ def recover_environment(dataset: MinariDataset, *, allow_import: bool = False) -
         raise InvalidDataError(name, expected="the environment that it was recorded in", actual="none (env_spec)")
     made = spec if allow_import else _registered(name, spec)
     try:
-        return gym.make(made, disable_env_checker=True)
+        return gym.make(without_window(made), disable_env_checker=True)
     except (ImportError, AttributeError, TypeError, ValueError, gym.error.Error) as error:
         raise InvalidDataError(
             f"{name}: environment {spec.id!r}",
@@ -257,101 +231,3 @@ def _registered(name: str, spec: EnvSpec) -> EnvSpec:
             f"{name}: environment {spec.id!r}", expected="no wrappers to import", actual=wrappers, hint=hint
         )
     return replace(known, kwargs=dict(spec.kwargs), max_episode_steps=spec.max_episode_steps)
-
-
-class _Simulation:
-    """Steps the environment along recorded episodes and keeps the largest deviations."""
-
-    def __init__(self, env: Env, name: str) -> None:
-        self.env, self.name = env, name
-        self.task = env.unwrapped if isinstance(env.unwrapped, ControlTask) else None
-        self.episodes = self.steps = 0
-        self.free_run = dict.fromkeys(QUANTITIES, Deviation())
-        self.one_step = dict.fromkeys(QUANTITIES, Deviation()) if self.task is not None else {}
-        self.wrong_ends: list[int] = []
-        self.skipped: list[tuple[int, str]] = []
-
-    def run(self, episode: Any) -> None:
-        """Simulates one episode."""
-        number = int(episode.id)
-        states = (episode.infos or {}).get("state")
-        if states is None:
-            raise InvalidDataError(
-                f"{self.name}, episode {number}: infos/state", expected="the state at every step", actual="none"
-            )
-        recorded = {
-            "observation": np.asarray(episode.observations),
-            "state": np.asarray(states),
-            "cost": np.concatenate([[0.0], -np.asarray(episode.rewards, dtype=np.float64)]),
-        }
-        known = np.isfinite(recorded["state"]).all(axis=1)
-        if not known.all():
-            # Recording began within the episode: from the first known state on.
-            first = int(np.argmax(known)) if known.any() else len(known)
-            if first >= len(episode.actions):
-                self.skipped.append((number, "no finite state to start from"))
-                return
-        else:
-            first = 0
-        recorded = {key: value[first:] for key, value in recorded.items()}
-        recorded["cost"][0] = 0.0  # that of the step before
-        actions = np.asarray(episode.actions)[first:]
-        try:
-            simulated, terminated = self._simulate(recorded["state"][0], actions)
-        except MPCOfflineError:
-            raise
-        except ValueError as error:  # a state that the environment does not start from
-            self.skipped.append((number, str(error)))
-            return
-        self.episodes, self.steps = self.episodes + 1, self.steps + len(actions)
-        self._compare(self.free_run, recorded, simulated, number, first)
-        if terminated != list(map(bool, episode.terminations[first:])):
-            self.wrong_ends.append(number)
-        if self.task is not None:
-            self._compare(self.one_step, recorded, self._single_steps(recorded["state"], actions), number, first)
-
-    def _simulate(self, state: NDArray[Any], actions: NDArray[Any]) -> tuple[dict[str, NDArray[Any]], list[bool]]:
-        observation, info = self.env.reset(options={"state": state})
-        if "state" not in info or not np.array_equal(info["state"], state):
-            raise InvalidDataError(
-                f"{self.name}: its environment",
-                expected="one that starts from reset(options={'state': s}) and says so in info['state']",
-                actual=f"info['state'] = {info.get('state')} for s = {state}",
-            )
-        rows, terminations = [(observation, info["state"], 0.0)], []
-        for action in actions:
-            observation, reward, terminated, _, info = self.env.step(action)
-            rows.append((observation, info["state"], info.get("cost", -float(reward))))
-            terminations.append(bool(terminated))
-        return dict(zip(QUANTITIES, map(np.array, zip(*rows, strict=True)), strict=True)), terminations
-
-    def _single_steps(self, states: NDArray[Any], actions: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        if self.task is None:
-            return {}
-        space, before = self.task.action_space, states[:-1]
-        applied = np.clip(actions.astype(np.float64), space.low, space.high)
-        reached = np.concatenate([states[:1], self.task.next_state(before, applied)])
-        cost = np.concatenate([[0.0], self.task.cost(before, applied)])
-        return {"observation": self.task.observe(reached), "state": reached, "cost": cost}
-
-    @staticmethod
-    def _compare(
-        worst: dict[str, Deviation],
-        recorded: Mapping[str, NDArray[Any]],
-        simulated: Mapping[str, NDArray[Any]],
-        episode: int,
-        first: int,
-    ) -> None:
-        for key in worst:
-            if recorded[key].shape != simulated[key].shape:
-                worst[key] = Deviation(math.inf, math.inf, episode, first)
-                continue
-            a, b = recorded[key].astype(np.float64), simulated[key].astype(np.float64)
-            with np.errstate(invalid="ignore"):
-                absolute = np.where(a == b, 0.0, np.nan_to_num(np.abs(a - b), nan=np.inf))
-                relative = np.nan_to_num(absolute / (1.0 + np.abs(a)), nan=np.inf)
-            largest = float(absolute.max())
-            if largest > 0.0 and float(relative.max()) >= worst[key].relative:
-                place = np.unravel_index(int(relative.argmax()), relative.shape)
-                found = Deviation(float(absolute[place]), float(relative[place]), episode, first + int(place[0]))
-                worst[key] = found
