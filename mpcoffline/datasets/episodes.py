@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .checks import check_numbers
+
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
@@ -20,10 +22,13 @@ class EpisodeBuilder:
     Args:
         observation: First observation ``(ny,)``.
         info: The reset's info. Of the infos, ``"cost"`` and ``"state"`` are kept.
+
+    Raises:
+        InvalidDataError: For an observation that is not an array of numbers.
     """
 
     def __init__(self, observation: ArrayLike, info: Mapping[str, Any]) -> None:
-        self._observations = [np.array(observation)]
+        self._observations = [check_numbers("first observation", observation)]
         self._actions: list[NDArray[Any]] = []
         self._rewards: list[float] = []
         self._terminations: list[bool] = []
@@ -33,6 +38,11 @@ class EpisodeBuilder:
     def __len__(self) -> int:
         """Number of transitions."""
         return len(self._rewards)
+
+    @property
+    def last_observation(self) -> NDArray[Any]:
+        """The observation reached last ``(ny,)``."""
+        return self._observations[-1]
 
     @property
     def last_info(self) -> dict[str, NDArray[np.float64]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 from .checks import floats
 from .episodes import EpisodeBuilder
 from .minari_store import write_dataset
+from .policy_name import policy_name
 from .recording import Recording
 from .transitions import TransitionTable
 
@@ -41,11 +43,14 @@ def record(
     overwrite: bool = False,
     algorithm_name: str | None = None,
     description: str | None = None,
+    resume: bool = True,
 ) -> MinariDataset:
     """Runs a policy and records what happens, as safely as :class:`mpcoffline.MinariRecorder`.
 
-    A recording that was interrupted goes on with the episode after the last one finished; with a seed the result is the
-    same as without the interruption.
+    A recording that was interrupted goes on, with a warning, with the episode after the last one finished; with a seed
+    the result is the same as without the interruption. It goes on only where it is the same one: the policy (its name
+    and its code; not the numbers in it), the environment with its arguments, the seed, and the number of episodes.
+    Another one is kept elsewhere, which a warning says, and recording starts anew.
 
     Args:
         env: The environment or its id.
@@ -57,13 +62,15 @@ def record(
         overwrite: Whether an existing data set of this id may be replaced.
         algorithm_name: Stored as metadata; the name of the policy's class by default.
         description: Stored as metadata.
+        resume: False deletes what an interrupted recording of this id has left instead of continuing it: where numbers
+            in the policy have changed, a gain or weights.
 
     Returns:
         The stored data set.
 
     Raises:
-        InvalidArgumentError: For a bad id, another recorder at work on it, fewer than one episode, or an action
-            outside the action space; the episodes before are kept then.
+        InvalidArgumentError: For a bad id, spaces that cannot be stored, another recorder at work on it, fewer than one
+            episode, or an action outside the action space; the episodes before are kept then.
         StorageError: Where the disk refuses; the episodes before are kept.
     """
     check_integers(1, n_episodes=n_episodes)
@@ -76,7 +83,22 @@ def record(
         mode="replace" if overwrite else "new",
         algorithm_name=algorithm_name or getattr(policy, "__name__", type(policy).__name__),
         description=description,
+        origin={
+            "policy": policy_name(policy),
+            "plant": type(made.unwrapped).__qualname__,
+            "seed": seed,
+            "number of episodes": n_episodes,
+            "deterministic": deterministic,
+        },
+        resume=resume,
+        leftover="aside",
     )
+    if recording.resumed:
+        warnings.warn(
+            f"record: {recording.resumed} episodes of an interrupted recording of {dataset_id!r} are continued;"
+            " resume=False starts anew.",
+            stacklevel=2,
+        )
     try:
         for number in range(recording.resumed, n_episodes):
             episode_seed = None if seed is None else seed + number

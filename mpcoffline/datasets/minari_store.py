@@ -27,6 +27,7 @@ from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineE
 from .atomic import publish, sync_tree
 from .manifest import write_manifest
 from .recipes import TASKS, Recipe, catalog_file
+from .recording_lock import check_not_recorded
 from .writing import store_episodes
 
 if TYPE_CHECKING:
@@ -205,13 +206,15 @@ def write_dataset(
         The stored data set.
 
     Raises:
-        InvalidArgumentError: For a malformed id, one that exists, or no episode at all.
+        InvalidArgumentError: For a malformed id, one that exists or is being recorded, or no episode at all.
         StorageError: Where the disk is full or fails; nothing is left behind.
     """
     import minari
     from minari.dataset.minari_storage import MinariStorage
 
     check_new_dataset(dataset_id, overwrite=overwrite)
+    if recording is None:
+        check_not_recorded(dataset_id)
     iterator = iter(episodes)
     first = next(iterator, None)
     if first is None:

@@ -18,7 +18,8 @@ from gymnasium.envs.registration import EnvSpec
 from mpcoffline.errors import FileFormatError, UnknownIdError
 
 from .minari_store import check_dataset_id, dataset_path, is_local, list_datasets, recording_of, write_dataset
-from .recording import RecordingLock, log_files, recording_path, seal
+from .recording import seal
+from .recording_lock import RecordingLock, log_files, recording_path
 
 if TYPE_CHECKING:
     from minari import MinariDataset
