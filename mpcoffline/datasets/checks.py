@@ -1,11 +1,19 @@
-"""Checks of the arrays that become a transition table; an error names column, episode and step."""
+"""Checks of what is recorded and of the arrays that become a transition table.
+
+An error names column, episode and step.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from mpcoffline.errors import InvalidDataError
+from mpcoffline.errors import InvalidArgumentError, InvalidDataError
+
+NUMBERS = "fiub"  # the kinds of numpy types that a recording can hold
 
 
 def floats(name: str, column: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
@@ -73,3 +81,36 @@ def place(episode_ids: NDArray[np.int64] | None, row: int, steps_before: int = 0
     episode = int(episode_ids[row])
     step = row - int(np.flatnonzero(episode_ids == episode)[0])
     return f"episode {episode}, step {step + (steps_before if episode == episode_ids[0] else 0)}"
+
+
+def check_storable(name: str, space: spaces.Space[Any]) -> None:
+    """Refuses a space whose elements are not one array of numbers each, before anything is recorded.
+
+    Raises:
+        InvalidArgumentError: Naming the space and the wrapper that helps.
+    """
+    flat = isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
+    if flat or (isinstance(space, spaces.Box) and space.dtype.kind in NUMBERS):
+        return
+    observed = "gymnasium.wrappers.FlattenObservation" if "observation" in name else "a gymnasium.ActionWrapper"
+    raise InvalidArgumentError(
+        name,
+        expected="a Box of numbers",
+        actual=f"{type(space).__name__}: {space}",
+        hint=f"Make one array of it first, e.g. by {observed}.",
+    )
+
+
+def check_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
+    """A copy as an array, or ``InvalidDataError`` for objects, texts, records or a ragged list."""
+    try:
+        array = np.array(values)
+    except ValueError as error:
+        raise InvalidDataError(name, expected="an array of numbers", actual=str(error)) from error
+    if array.dtype.kind not in NUMBERS:
+        raise InvalidDataError(
+            name,
+            expected="an array of numbers",
+            actual=f"{type(values).__name__} of type {array.dtype} and shape {array.shape}",
+        )
+    return array

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -59,7 +59,8 @@ def collect(
         progress: Whether to show a progress bar with the running return.
 
     Returns:
-        The stored data set.
+        The stored data set. The agent always begins anew, and so does the recording: what an interrupted one of the
+        same recipe has left is removed, that of any other recording is kept elsewhere, and either is said.
 
     Raises:
         UnknownIdError: For an unknown task.
@@ -75,17 +76,11 @@ def collect_with(recipe: Recipe, *, overwrite: bool = False, progress: bool = Tr
     Raises:
         InvalidArgumentError: For an id that is malformed or exists.
     """
-    recorder = MinariRecorder(
-        recipe.dataset_id,
-        overwrite=overwrite,
-        algorithm_name=f"stable_baselines3.{recipe.algorithm}",
-        description=recipe.description,
-        cost_key="cost",  # the agent's reward is another
-    )
+    recorder = _RecipeRecorder(recipe, overwrite)
     bar = _ProgressBar(recipe.steps, recorder, f"{recipe.algorithm} learns {recipe.task}") if progress else None
     callbacks: list[BaseCallback] = [recorder, _StopAt(recipe.steps), *([bar] if bar else [])]
     # Two small networks: threads only get in each other's way.
-    with _torch_threads(1), bar.shown() if bar else nullcontext():
+    with _torch_threads(1), bar.shown() if bar else nullcontext(), closing(recorder):
         agent = make_agent(recipe)
         agent.learn(recipe.steps, callback=callbacks)
     if recorder.dataset is None:
@@ -213,6 +208,22 @@ def _noise(recipe: Recipe, shape: tuple[int, ...]) -> ActionNoise:
     raise InvalidArgumentError(
         "recipe noise kind", expected="'normal' or 'ornstein-uhlenbeck'", actual=repr(recipe.noise_kind)
     )
+
+
+class _RecipeRecorder(MinariRecorder):
+    """Starts anew where an interrupted one of the same recipe has left something, as the agent does."""
+
+    leftover = "restart"
+
+    def __init__(self, recipe: Recipe, overwrite: bool) -> None:
+        super().__init__(
+            recipe.dataset_id,
+            overwrite=overwrite,
+            algorithm_name=f"stable_baselines3.{recipe.algorithm}",
+            description=recipe.description,
+            cost_key="cost",  # the agent's reward is another
+        )
+        self.origin = asdict(recipe)
 
 
 class _StopAt(BaseCallback):

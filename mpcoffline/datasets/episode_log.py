@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 from mpcoffline.errors import FileFormatError, StorageError
 
+from .checks import NUMBERS, check_numbers
+
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
@@ -55,6 +57,7 @@ class LogHeader:
         env_spec: The environment's spec as JSON; None where it has none.
         algorithm_name: Metadata.
         description: Metadata.
+        origin: What else makes it this recording and no other, a JSON object; None where nothing is known.
     """
 
     dataset_id: str
@@ -65,6 +68,7 @@ class LogHeader:
     env_spec: str | None = None
     algorithm_name: str | None = None
     description: str | None = None
+    origin: str | None = None
 
 
 @dataclass(frozen=True)
@@ -84,10 +88,13 @@ class LoggedEpisode:
 
     @classmethod
     def of(cls, buffer: EpisodeBuffer, sequence: int, *, complete: bool) -> LoggedEpisode:
-        """Takes over the arrays of Minari's buffer."""
+        """Takes over the arrays of Minari's buffer; ``InvalidDataError`` where one is not of numbers."""
         infos = {f"infos/{key}": value for key, value in (buffer.infos or {}).items()}
         columns = {key: getattr(buffer, key) for key in ("observations", *_STEPS)}
-        return cls(sequence, complete, {key: np.asarray(value) for key, value in (columns | infos).items()})
+        named = (columns | infos).items()
+        return cls(
+            sequence, complete, {key: check_numbers(f"episode {sequence}: {key}", value) for key, value in named}
+        )
 
     def __len__(self) -> int:
         """Number of transitions."""
@@ -310,7 +317,7 @@ def _decode_header(content: bytes, path: Path) -> LogHeader:
     except TypeError as error:
         raise FileFormatError(f"log {path}, header", expected="its fields", actual=str(error)) from error
     required = (header.dataset_id, header.recording, header.mode, header.observation_space, header.action_space)
-    optional = (header.env_spec, header.algorithm_name, header.description)
+    optional = (header.env_spec, header.algorithm_name, header.description, header.origin)
     if not all(isinstance(text, str) for text in (*required, *(text for text in optional if text is not None))):
         raise FileFormatError(f"log {path}, header", expected="texts", actual="something else")
     return header
@@ -334,7 +341,7 @@ def _decode(content: bytes, where: str) -> LoggedEpisode:
         arrays, offset = {}, _CRC.size + length
         for key, code, shape in description["arrays"]:
             dtype = np.dtype(str(code))
-            if dtype.kind not in "fiub" or min(shape, default=0) < 0:
+            if dtype.kind not in NUMBERS or min(shape, default=0) < 0:
                 raise ValueError(f"{key} of type {dtype} and shape {shape}")
             values: NDArray[Any] = np.frombuffer(content, dtype, int(np.prod(shape, dtype=np.int64)), offset)
             arrays[str(key)] = values.reshape(shape).copy()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .checks import check_numbers
 from .stage_cost import PlantInfo
 
 if TYPE_CHECKING:
@@ -22,11 +23,14 @@ class EpisodeBuilder:
         observation: First observation ``(ny,)``.
         info: The reset's info.
         rule: What is taken from infos, the same for all episodes of a recording.
+
+    Raises:
+        InvalidDataError: For an observation that is not an array of numbers.
     """
 
     def __init__(self, observation: ArrayLike, info: Mapping[str, Any], rule: PlantInfo) -> None:
         self._rule = rule
-        self._observations = [np.array(observation)]
+        self._observations = [check_numbers("first observation", observation)]
         self._actions: list[NDArray[Any]] = []
         self._rewards: list[float] = []
         self._terminations: list[bool] = []
@@ -44,6 +48,11 @@ class EpisodeBuilder:
         state = self._states[-1]
         known = {} if math.isnan(self._costs[-1]) else {self._rule.key: self._costs[-1]}
         return known if state is None else known | {"state": state}
+
+    @property
+    def last_observation(self) -> NDArray[Any]:
+        """The observation reached last ``(ny,)``."""
+        return self._observations[-1]
 
     def add(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 from .checks import floats
 from .minari_store import write_dataset
 from .plants import check_spaces, check_units, in_units, opened, plain_spec, step_cap
+from .policy_name import policy_name
 from .recording import Recording
 from .rollouts import run_episode
 from .stage_cost import PlantInfo
@@ -46,11 +48,14 @@ def record(
     description: str | None = None,
     cost_key: str | None = None,
     max_episode_steps: int | None = None,
+    resume: bool = True,
 ) -> MinariDataset:
     """Runs a policy and records what happens, as safely as :class:`mpcoffline.MinariRecorder`.
 
-    A recording that was interrupted goes on with the episode after the last one finished; with a seed the result is the
-    same as without the interruption.
+    A recording that was interrupted goes on, with a warning, with the episode after the last one finished; with a seed
+    the result is the same as without the interruption. It goes on only where it is the same one: the policy (its name
+    and its code; not the numbers in it), the environment with its arguments, the seed, and the number of episodes.
+    Another one is kept elsewhere, which a warning says, and recording starts anew.
 
     What is recorded is what the plant sees and pays, in its units: the reward below wrappers that change it, and
     -``info["cost"]`` in its place where the two are the same in float32. Where they are not, that key means something
@@ -72,14 +77,16 @@ def record(
             it proves to be. A key that is named must be there and equal at each step.
         max_episode_steps: Steps after which an episode is one without end, an error; by default 10,000, or the
             environment's own limit where that is larger.
+        resume: False deletes what an interrupted recording of this id has left instead of continuing it: where numbers
+            in the policy have changed, a gain or weights.
 
     Returns:
         The stored data set.
 
     Raises:
-        InvalidArgumentError: For a bad id, another recorder at work on it, fewer than one episode, a policy of other
-            spaces, or wrappers that rescale. For an action outside the action space, an episode without end, or a
-            ``cost_key`` that is not there: the episodes before are kept then.
+        InvalidArgumentError: For a bad id, spaces that cannot be stored, another recorder at work on it, fewer than one
+            episode, a policy of other spaces, or wrappers that rescale. For an action outside the action space, an
+            episode without end, or a ``cost_key`` that is not there: the episodes before are kept then.
         InvalidDataError: Where ``cost_key`` is not minus the reward; the episodes before are kept.
         UnknownIdError: For an environment id that is not registered.
         StorageError: Where the disk refuses; the episodes before are kept.
@@ -101,7 +108,22 @@ def record(
         mode="replace" if overwrite else "new",
         algorithm_name=algorithm_name or getattr(policy, "__name__", type(policy).__name__),
         description=description,
+        origin={
+            "policy": policy_name(policy),
+            "plant": type(made.unwrapped).__qualname__,
+            "seed": first_seed,
+            "number of episodes": int(n_episodes),
+            "deterministic": deterministic,
+        },
+        resume=resume,
+        leftover="aside",
     )
+    if recording.resumed:
+        warnings.warn(
+            f"record: {recording.resumed} episodes of an interrupted recording of {dataset_id!r} are continued;"
+            " resume=False starts anew.",
+            stacklevel=2,
+        )
     try:
         for number in range(recording.resumed, n_episodes):
             episode_seed = None if first_seed is None else first_seed + number

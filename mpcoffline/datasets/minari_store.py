@@ -30,6 +30,7 @@ from .ids import GRAMMAR, is_valid_id
 from .manifest import write_manifest
 from .opening import open_dataset, read_metadata
 from .recipes import TASKS, Recipe, catalog_file
+from .recording_lock import check_not_recorded
 from .writing import store_episodes
 
 if TYPE_CHECKING:
@@ -234,12 +235,14 @@ def write_dataset(
         The stored data set.
 
     Raises:
-        InvalidArgumentError: For a malformed id, one that exists, or no episode at all.
+        InvalidArgumentError: For a malformed id, one that exists or is being recorded, or no episode at all.
         StorageError: Where the disk is full or fails; nothing is left behind.
     """
     from minari.dataset.minari_storage import MinariStorage
 
     check_new_dataset(dataset_id, overwrite=overwrite)
+    if recording is None:
+        check_not_recorded(dataset_id)
     iterator = iter(episodes)
     first = next(iterator, None)
     if first is None:

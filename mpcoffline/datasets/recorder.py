@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError
 
+from .checks import check_storable
 from .episodes import EpisodeBuilder
 from .minari_store import check_new_dataset
 from .plants import common_spec
@@ -24,6 +26,10 @@ from .vec_watching import VecWatch
 
 if TYPE_CHECKING:
     from minari import MinariDataset
+
+_SAME_SEED = (
+    " The agent begins anew: where its seed ({0}) is that of the interrupted one, it records the same episodes again."
+)
 
 
 class MinariRecorder(BaseCallback):
@@ -70,15 +76,19 @@ class MinariRecorder(BaseCallback):
 
     Raises:
         InvalidArgumentError: At construction for an id against Minari's grammar, or one that exists; at the
-            start of training for an on-policy algorithm, observations that are not a Box, copies of an environment
-            with different arguments, another recorder at work on this id, or an interrupted recording with other
-            spaces; during training for a ``cost_key`` that is not there.
+            start of training for an on-policy algorithm, observations or actions that are not one array of numbers,
+            copies of an environment with different arguments, another recorder at work on this id, an interrupted
+            recording of another plant or algorithm, or another plant than that of the data set that this recorder made
+            before; during training for a ``cost_key`` that is not there.
         InvalidDataError: During training where ``cost_key`` is not minus the reward.
         StorageError: During training where the disk is full or fails; the episodes before are safe.
 
     Example:
         ``agent.learn(50_000, callback=MinariRecorder("mpcoffline/pendulum/mine-v0"))``
     """
+
+    leftover: ClassVar[str] = "refuse"
+    origin: Mapping[str, Any] | None = None
 
     def __init__(
         self,
@@ -109,6 +119,8 @@ class MinariRecorder(BaseCallback):
         self._recording: Recording | None = None
         self._plants: VecWatch | None = None
         self._rule = PlantInfo("MinariRecorder", cost_key)
+        self._env: VecEnv | None = None
+        self._plant: str | None = None
 
     def close(self) -> None:
         """Lets go of the logs of a training that was interrupted, so that another recorder can continue them."""
@@ -122,10 +134,19 @@ class MinariRecorder(BaseCallback):
     def _on_training_start(self) -> None:
         agent = self._agent()
         self.close()
+        check_storable("observation space", agent.observation_space)
         env_spec = common_spec("MinariRecorder", self.training_env.get_attr("spec"))
+        plant = _class_of(self.training_env)
+        if self.dataset is not None and self._plant != plant and None not in (plant, self._plant):
+            raise InvalidArgumentError(
+                f"environment of what extends data set {self.dataset_id!r}",
+                expected=f"that of the data set: {self._plant}",
+                actual=str(plant),
+                hint="One data set holds one plant: record another one under another id, with a recorder of its own.",
+            )
         plants = self._plants = VecWatch(self.training_env, "MinariRecorder")
         self._rule = PlantInfo("MinariRecorder", self.cost_key)
-        _warn_of_changed_spaces(plants, env_spec)
+        _warn_of_changed_spaces(plants, self.training_env)
         self._recording = Recording(
             self.dataset_id,
             env_spec=env_spec,
@@ -135,23 +156,40 @@ class MinariRecorder(BaseCallback):
             mode="extend" if self.dataset is not None else "replace" if self.overwrite else "new",
             algorithm_name=self.algorithm_name or type(self.model).__name__,
             description=self.description,
+            origin=self.origin or ({"plant": plant} if plant else None),
             resume=self.resume,
+            leftover=self.leftover,
             sync_episodes=self.sync_episodes,
             sync_seconds=self.sync_seconds,
         )
         if self._recording.resumed:
+            again = "" if agent.num_timesteps or agent.seed is None else _SAME_SEED.format(agent.seed)
             warnings.warn(
                 f"MinariRecorder: {self._recording.resumed} episodes of an interrupted recording of"
-                f" {self.dataset_id!r} are continued; resume=False starts anew.",
+                f" {self.dataset_id!r} are continued; resume=False starts anew.{again}",
                 stacklevel=2,
             )
         observations = plants.first_observations(self._before(agent))
-        if agent.num_timesteps == 0:
-            infos = list(plants.reset_infos)
-        else:
-            # SB3 goes on in the middle of an episode: the reset infos belong to another state.
-            infos = [builder.last_info for builder in self._running] or [{} for _ in observations]
+        infos = self._first_infos(observations, plants.reset_infos)
         self._running = [EpisodeBuilder(s, info, self._rule) for s, info in zip(observations, infos, strict=True)]
+        self._env, self._plant = self.training_env, plant
+
+    def _first_infos(
+        self, observations: np.ndarray[Any, Any], reset_infos: Sequence[Mapping[str, Any]]
+    ) -> list[Mapping[str, Any]]:
+        """What is known of the states from which this `learn` starts: nothing where an episode is joined halfway."""
+        env, count = self.training_env, len(observations)
+        fresh = [True] * count if self.locals["reset_num_timesteps"] else _fresh(env)
+        before = self._running if env is self._env else []
+        infos: list[Mapping[str, Any]] = (
+            [
+                b.last_info if np.array_equal(b.last_observation, s) else {}
+                for b, s in zip(before, observations, strict=True)
+            ]
+            if before
+            else [{}] * count
+        )
+        return [reset if new else info for new, reset, info in zip(fresh, reset_infos, infos, strict=True)]
 
     def _on_step(self) -> bool:
         recording, plants = self._started()
@@ -199,12 +237,6 @@ class MinariRecorder(BaseCallback):
                 expected="an off-policy SB3 algorithm (DDPG, TD3, SAC, ...)",
                 actual=type(self.model).__name__,
             )
-        if not isinstance(self.model.observation_space, spaces.Box):
-            raise InvalidArgumentError(
-                "MinariRecorder's observation space",
-                expected="a Box",
-                actual=str(self.model.observation_space),
-            )
         return self.model
 
     @staticmethod
@@ -214,17 +246,45 @@ class MinariRecorder(BaseCallback):
         return np.array(before)
 
 
-def _warn_of_changed_spaces(env: VecWatch, spec: EnvSpec | None) -> None:
+def _fresh(env: VecEnv) -> list[bool]:
+    """Which environments have been reset and not stepped since: all where SB3 goes on after `set_env` or `load`."""
+    # Monitor keeps the rewards since the reset, TimeLimit counts; asked for first: without them a worker would die.
+    if all(env.env_is_wrapped(Monitor)):
+        return [len(rewards) == 0 for rewards in env.get_attr("rewards")]
+    if all(env.env_is_wrapped(gym.wrappers.TimeLimit)):
+        return [steps == 0 for steps in env.get_attr("_elapsed_steps")]
+    return [False] * env.num_envs
+
+
+def _warn_of_changed_spaces(plants: VecWatch, env: VecEnv) -> None:
     """Warns where a training wrapper changes what is recorded, so that the spec does not rebuild it."""
-    if spec is None:
-        return
-    plain = gym.make(spec)
+    inner = _without_wrappers(env)
     for kind in ("observation_space", "action_space"):
-        recorded, original = getattr(env, kind), getattr(plain, kind)
-        if recorded != original:
+        recorded, original = getattr(plants, kind), getattr(inner, kind, None)
+        if original is not None and recorded != original:
             warnings.warn(
                 f"MinariRecorder: a wrapper changes the {kind} to {recorded}, and that is what gets recorded;"
                 f" dataset.recover_environment() gives {original}. Scale inside the agent instead.",
                 stacklevel=3,
             )
-    plain.close()
+
+
+def _class_of(env: VecEnv) -> str | None:
+    """The class of the plant, which tells plants without a spec apart; None where it is in another process."""
+    if not isinstance(env.unwrapped, DummyVecEnv):
+        return None
+    return type(env.unwrapped.envs[0].unwrapped).__qualname__
+
+
+def _without_wrappers(env: VecEnv) -> gym.Env[Any, Any] | None:
+    """The first environment as its plain spec rebuilds it; None where it is in another process.
+
+    No second one is made of the spec: a plant that is a machine exists once.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, DummyVecEnv) or inner.envs[0].spec is None:
+        return None
+    plain: gym.Env[Any, Any] = inner.envs[0]
+    while isinstance(plain, gym.Wrapper) and plain.spec is not None and plain.spec.additional_wrappers:
+        plain = plain.env
+    return plain

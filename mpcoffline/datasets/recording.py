@@ -1,18 +1,14 @@
-"""One recording: the logs of a data set in the making, who may write them, and how they become the data set.
-
-The logs are ``<Minari store>/.recording/<data set id>/env-0000.log``, one for each environment. ``lock`` beside
-them is held while somebody records or seals; the system frees it with the process, however that ends.
-"""
+"""One recording: the logs of a data set in the making, and how they become the data set."""
 
 from __future__ import annotations
 
-import fcntl
 import heapq
+import json
 import os
 import shutil
-import socket
 import uuid
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,82 +18,15 @@ from gymnasium.envs.registration import EnvSpec
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageError
 
 from .atomic import sync_folder
+from .checks import check_storable
 from .episode_log import EpisodeLog, LoggedEpisode, LogHeader, LogIndex, scan
 from .minari_store import check_new_dataset, dataset_path, is_local, recording_of, write_dataset
 from .opening import open_dataset
+from .recording_lock import RecordingLock, log_files, recording_path
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
-
-
-def recording_path(dataset_id: str) -> Path:
-    """The folder of a data set's logs, whether it exists or not."""
-    return dataset_path("") / ".recording" / dataset_id
-
-
-def log_files(dataset_id: str) -> list[Path]:
-    """The logs of a data set that have not been sealed."""
-    return sorted(recording_path(dataset_id).glob("env-*.log"))
-
-
-class RecordingLock:
-    """The right to write a data set's logs; the lock of a process that has died is free.
-
-    Args:
-        dataset_id: The data set.
-
-    Raises:
-        InvalidArgumentError: Where somebody else has it; names the process.
-    """
-
-    def __init__(self, dataset_id: str) -> None:
-        self.folder = recording_path(dataset_id)
-        self._path = self.folder / "lock"
-        self._fd = -1
-        while self._fd < 0:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                holder = os.read(descriptor, 200).decode(errors="replace") or "another process"
-                os.close(descriptor)
-                raise InvalidArgumentError(
-                    f"data set {dataset_id!r}",
-                    expected="one recorder at a time",
-                    actual=f"another one at work ({holder})",
-                    hint="Wait for it, or record under another id; an interrupted recorder of this process is freed by"
-                    " `recorder.close()`.",
-                ) from error
-            # Who held it may have removed the file in the meantime: then it is not the lock any more.
-            if self._path.exists() and self._path.stat().st_ino == os.fstat(descriptor).st_ino:
-                self._fd = descriptor
-            else:
-                os.close(descriptor)
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
-
-    def release(self) -> None:
-        """Gives it back, and removes the folder where there are no logs in it; harmless when repeated."""
-        if self._fd < 0:
-            return
-        if not any(self.folder.glob("env-*.log")):
-            shutil.rmtree(self.folder / "building", ignore_errors=True)
-            self._path.unlink(missing_ok=True)
-            folder = self.folder
-            while folder != dataset_path(""):
-                try:
-                    folder.rmdir()
-                except OSError:
-                    break
-                folder = folder.parent
-        os.close(self._fd)
-        self._fd = -1
-
-    def __del__(self) -> None:
-        if getattr(self, "_fd", -1) >= 0:
-            os.close(self._fd)
 
 
 class Recording:
@@ -111,7 +40,12 @@ class Recording:
         mode: What becomes of a data set of this id: ``"new"``, ``"replace"`` or ``"extend"``.
         algorithm_name: Metadata.
         description: Metadata.
+        origin: What else makes it this recording and no other (policy, seed, number of episodes, ...), by name.
         resume: False deletes the logs of an interrupted recording instead of continuing them.
+        leftover: What becomes of the logs of an interrupted recording. They are continued where it is the same one:
+            environment, spaces, algorithm and ``origin`` are equal. Another one is an error (``"refuse"``), or is put
+            aside with a warning (``"aside"``). ``"restart"`` continues none: the same one is deleted, another one is
+            put aside.
         sync_episodes: See :class:`EpisodeLog`.
         sync_seconds: See :class:`EpisodeLog`.
 
@@ -119,8 +53,8 @@ class Recording:
         resumed: Number of episodes found in the logs.
 
     Raises:
-        InvalidArgumentError: For an id that exists (mode ``"new"``), another recorder at work on it, or
-            logs with other spaces or of another environment.
+        InvalidArgumentError: For an id that exists (mode ``"new"``), another recorder at work on it, spaces that cannot
+            be stored, the logs of another recording (``"refuse"``), or a data set of another plant (``"extend"``).
         FileFormatError: For logs that are damaged.
         StorageError: Where the disk refuses.
     """
@@ -135,37 +69,41 @@ class Recording:
         mode: str = "new",
         algorithm_name: str | None = None,
         description: str | None = None,
+        origin: Mapping[str, Any] | None = None,
         resume: bool = True,
+        leftover: str = "refuse",
         sync_episodes: int = 10,
         sync_seconds: float = 5.0,
     ) -> None:
         from minari.serialization import serialize_space
 
         check_new_dataset(dataset_id, overwrite=mode != "new")
+        check_storable("observation space", observation_space)
+        check_storable("action space", action_space)
         self.dataset_id = dataset_id
         self._settings: dict[str, Any] = {"sync_episodes": sync_episodes, "sync_seconds": sync_seconds}
         self._logs: dict[int, EpisodeLog] = {}
+        self.header = LogHeader(
+            dataset_id,
+            uuid.uuid4().hex,
+            mode,
+            str(serialize_space(observation_space)),
+            str(serialize_space(action_space)),
+            _spec_json(env_spec),
+            algorithm_name,
+            description,
+            _origin_json(origin),
+        )
+        _check_extends(self.header)
+        self._lock = RecordingLock(dataset_id)
         try:
-            self._lock = RecordingLock(dataset_id)
-        except OSError as error:
-            raise StorageError.of(recording_path(dataset_id), error) from error
-        try:
-            done = recording_of(dataset_id)
-            indices = [scan(path) for path in log_files(dataset_id)]
-            if not resume or any(index.header.recording == done for index in indices):
+            if not resume:
                 _remove_logs(dataset_id)
+            indices = [scan(path) for path in log_files(dataset_id)]
+            if indices and _are_continued(indices, self.header, leftover):
+                self.header = indices[0].header
+            else:
                 indices = []
-            header = LogHeader(
-                dataset_id,
-                uuid.uuid4().hex,
-                mode,
-                str(serialize_space(observation_space)),
-                str(serialize_space(action_space)),
-                _spec_json(env_spec),
-                algorithm_name,
-                description,
-            )
-            self.header = _continued(indices, header) if indices else header
             self.resumed = sum(len(index.records) for index in indices)
             self._sequence = max((e.sequence + 1 for index in indices for e in index.episodes()), default=0)
         except BaseException:
@@ -181,8 +119,10 @@ class Recording:
             complete: False for one that recording cuts off.
 
         Raises:
+            InvalidArgumentError: After the end, or in a fork of the process that records.
             StorageError: Where the disk refuses; what was written before is intact.
         """
+        self._check_held()
         if env not in self._logs:
             path = self._lock.folder / f"env-{env:04d}.log"
             self._logs[env] = EpisodeLog(path, self.header, **self._settings)
@@ -200,6 +140,7 @@ class Recording:
 
     def seal(self) -> MinariDataset:
         """Closes the logs and makes the data set of them; see :func:`seal`."""
+        self._check_held()
         self._close_logs(finished=True)
         try:
             return _seal(self.dataset_id)
@@ -210,6 +151,14 @@ class Recording:
         """Lets go without sealing: the logs stay, to be continued or repaired; harmless when repeated."""
         self._close_logs(finished=False)
         self._lock.release()
+
+    def _check_held(self) -> None:
+        if not self._lock.held:
+            raise InvalidArgumentError(
+                f"recording of {self.dataset_id!r}",
+                expected="the process that began it, before its end",
+                actual=f"process {os.getpid()}, which does not hold its lock",
+            )
 
     def _close_logs(self, *, finished: bool) -> None:
         for log in self._logs.values():
@@ -245,9 +194,17 @@ def _seal(dataset_id: str) -> MinariDataset:
     if sum(len(index.records) for index in indices) == 0:
         _remove_logs(dataset_id)
         raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
-    header = _continued(indices, indices[0].header)
+    header = _common_header(indices)
     if recording_of(dataset_id) != header.recording:
-        check_new_dataset(dataset_id, overwrite=header.mode != "new")
+        _check_extends(header)
+        if is_local(dataset_id) and header.mode == "new":
+            raise InvalidArgumentError(
+                f"data set {dataset_id!r}",
+                expected="none of that id, which the recording is to become",
+                actual=f"another one in {dataset_path(dataset_id)}",
+                hint=f"It exists since the recording began. Move its folder away, then `mpcoffline datasets repair"
+                f" {dataset_id}`: the recording is kept.",
+            )
         building = recording_path(dataset_id) / "building"
         shutil.rmtree(building, ignore_errors=True)
         aside = building.with_name("building-replaced")
@@ -276,35 +233,115 @@ def _in_order(indices: list[LogIndex]) -> Iterator[LoggedEpisode]:
     return heapq.merge(*(index.episodes() for index in indices), key=lambda episode: episode.sequence)
 
 
-def _continued(indices: list[LogIndex], header: LogHeader) -> LogHeader:
-    """The header that the logs share, or an error where they differ in it or hold other spaces than ``header``."""
+def _common_header(indices: list[LogIndex]) -> LogHeader:
+    """The header that the logs share, or an error where they are of different recordings."""
     first = indices[0].header
     for index in indices:
         if index.header.recording != first.recording:
             raise FileFormatError(
                 f"log {index.path}", expected=f"a log of recording {first.recording}", actual=index.header.recording
             )
-    for kind in ("observation_space", "action_space"):
-        if getattr(first, kind) != getattr(header, kind):
-            raise InvalidArgumentError(
-                kind.replace("_", " "),
-                expected=f"that of the interrupted recording of {header.dataset_id!r}: {getattr(first, kind)}",
-                actual=getattr(header, kind),
-                hint=f"Seal it first (`mpcoffline datasets repair {header.dataset_id}`), or pass resume=False.",
-            )
-    if None not in (first.env_spec, header.env_spec) and first.env_spec != header.env_spec:
-        raise InvalidArgumentError(
-            "environment",
-            expected=f"that of the interrupted recording of {header.dataset_id!r}: {first.env_spec}",
-            actual=str(header.env_spec),
-            hint=f"Seal it first (`mpcoffline datasets repair {header.dataset_id}`), or pass resume=False.",
-        )
     return first
+
+
+def _are_continued(indices: list[LogIndex], header: LogHeader, leftover: str) -> bool:
+    """Whether a new recording goes on with these logs; where not, they are out of its way. See :class:`Recording`."""
+    first, name = _common_header(indices), header.dataset_id
+    differences = _differences(first, header)
+    if not differences and leftover != "restart" and first.recording != recording_of(name):
+        return True
+    found = sum(len(index.records) for index in indices)
+    if found == 0 or first.recording == recording_of(name):
+        _remove_logs(name)
+    elif not differences:
+        _remove_logs(name)
+        warnings.warn(f"{found} episodes of an interrupted recording of {name!r} are recorded anew.", stacklevel=3)
+    elif leftover == "refuse":
+        what, theirs, ours = differences[0]
+        raise InvalidArgumentError(
+            what,
+            expected=f"that of the interrupted recording of {name!r}: {theirs}",
+            actual=ours,
+            hint=f"Seal it first (`mpcoffline datasets repair {name}`), or pass resume=False.",
+        )
+    else:
+        kept = _set_aside(name)
+        because = "; ".join(f"{what} {theirs}, now {ours}" for what, theirs, ours in differences)
+        warnings.warn(
+            f"An interrupted recording of {name!r} is another one ({because}): it is not continued."
+            f" Its {found} episodes are kept in {kept}.",
+            stacklevel=3,
+        )
+    return False
+
+
+def _differences(first: LogHeader, second: LogHeader) -> list[tuple[str, str, str]]:
+    """In what two recordings of one id are not the same: what, in the first, in the second."""
+    pairs: dict[str, tuple[Any, Any]] = {
+        "observation space": (first.observation_space, second.observation_space),
+        "action space": (first.action_space, second.action_space),
+        "environment": _plants(first.env_spec, second.env_spec),
+        "algorithm": (first.algorithm_name, second.algorithm_name),
+        "extends a data set": (first.mode == "extend", second.mode == "extend"),
+    }
+    theirs, ours = (json.loads(header.origin or "{}") for header in (first, second))
+    # The plant's class is not known where it is in another process.
+    keys = {*theirs, *ours} - ({"plant"} if "plant" not in theirs or "plant" not in ours else set())
+    pairs |= {key: (theirs.get(key), ours.get(key)) for key in sorted(keys)}
+    return [(what, str(a), str(b)) for what, (a, b) in pairs.items() if a != b]
+
+
+def _check_extends(header: LogHeader) -> None:
+    """Refuses a recording that is to extend the data set of another plant, which stays as it is."""
+    if header.mode != "extend" or not is_local(header.dataset_id):
+        return
+    stored = json.loads((dataset_path(header.dataset_id) / "data" / "metadata.json").read_text(encoding="utf-8"))
+    pairs = {
+        "environment": _plants(stored.get("env_spec"), header.env_spec),
+        "observation space": (stored.get("observation_space"), header.observation_space),
+        "action space": (stored.get("action_space"), header.action_space),
+    }
+    for what, (theirs, ours) in pairs.items():
+        if theirs != ours:
+            raise InvalidArgumentError(
+                f"{what} of what extends data set {header.dataset_id!r}",
+                expected=f"that of the data set: {theirs}",
+                actual=str(ours),
+                hint="One data set holds one plant: record another plant under another id, with a recorder of its own.",
+            )
+
+
+def _plants(first: str | None, second: str | None) -> tuple[str | None, str | None]:
+    """Two specs as short as they can be told apart: id and arguments, or all of it."""
+    try:
+        found = [None if spec is None else json.loads(spec) for spec in (first, second)]
+        short = [None if spec is None else f"{spec['id']} with {spec['kwargs']}" for spec in found]
+    except (ValueError, TypeError, KeyError):
+        return first, second
+    return (short[0], short[1]) if (short[0] == short[1]) == (first == second) else (first, second)
+
+
+def _set_aside(dataset_id: str) -> Path:
+    """Moves the logs to where nobody continues them; moved back, they can be repaired."""
+    number = 0
+    while (kept := dataset_path("") / ".broken" / f"{dataset_id}-recording-{number}").exists():
+        number += 1
+    try:
+        kept.mkdir(parents=True)
+        for path in log_files(dataset_id):
+            path.rename(kept / path.name)
+    except OSError as error:
+        raise StorageError.of(kept, error) from error
+    return kept
 
 
 def _remove_logs(dataset_id: str) -> None:
     for path in log_files(dataset_id):
         path.unlink()
+
+
+def _origin_json(origin: Mapping[str, Any] | None) -> str | None:
+    return None if origin is None else json.dumps(origin, sort_keys=True, default=str)
 
 
 def _spec_json(spec: EnvSpec | None) -> str | None:

@@ -27,7 +27,8 @@ from .hdf5_guard import check_episodes
 from .manifest import MANIFEST, differences
 from .minari_store import check_dataset_id, dataset_path, finish, is_local, list_datasets, recording_of
 from .opening import DATA_FILE, check_space, open_dataset
-from .recording import RecordingLock, log_files, recording_path, seal
+from .recording import seal
+from .recording_lock import RecordingLock, log_files, recording_path
 
 _STEPS = ("actions", "rewards", "terminations", "truncations")
 

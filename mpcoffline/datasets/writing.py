@@ -110,9 +110,8 @@ class SteadyFile(io.RawIOBase):
         """As every file's, but that it never fails."""
         size = self._position if size is None else size
         self.flush()
-        if self._error is None:
-            if self._try(lambda: os.ftruncate(self._fd, size)):
-                self._base = size
+        if self._error is None and self._try(lambda: os.ftruncate(self._fd, size)):
+            self._base = size
         self._tail.extend(bytes(max(0, size - self._base - len(self._tail))))
         return size
 

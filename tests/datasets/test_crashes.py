@@ -21,7 +21,8 @@ from crashing import DATASET, check_survivors, count_calls, episode, kill_at_cal
 from mpcoffline.datasets import load_dataset, repair
 from mpcoffline.datasets.episode_log import scan
 from mpcoffline.datasets.manifest import read_manifest, sha256_of, write_manifest
-from mpcoffline.datasets.recording import log_files, seal
+from mpcoffline.datasets.recording import seal
+from mpcoffline.datasets.recording_lock import log_files
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageError, UnknownIdError
 
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from mpcoffline.datasets import dataset_from_arrays, repair, writing
 from mpcoffline.datasets.packed import pack, packed_size
-from mpcoffline.datasets.recording import log_files
+from mpcoffline.datasets.recording_lock import log_files
 from mpcoffline.datasets.writing import SteadyFile, write_steadily
 from mpcoffline.errors import StorageError
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mpcoffline.datasets import TransitionTable, dataset_from_arrays, from_csv, record
-from mpcoffline.datasets.recording import log_files
+from mpcoffline.datasets.recording_lock import log_files
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"

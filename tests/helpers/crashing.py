@@ -16,7 +16,8 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from mpcoffline.datasets import repair
-from mpcoffline.datasets.recording import Recording, log_files
+from mpcoffline.datasets.recording import Recording
+from mpcoffline.datasets.recording_lock import log_files
 from mpcoffline.errors import UnknownIdError
 
 DATASET = "test/crash-v0"
