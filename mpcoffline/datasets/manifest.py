@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError
 
 MANIFEST = "SHA256SUMS"
@@ -35,7 +36,7 @@ class Difference:
     actual: str
 
     def __str__(self) -> str:
-        return f"{self.path}: expected {self.expected}, got {self.actual}"
+        return visible(f"{self.path}: expected {self.expected}, got {self.actual}")
 
 
 def sha256_of(path: Path) -> str:

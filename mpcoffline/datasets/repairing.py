@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
+from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError, UnknownIdError
 
 from .minari_store import check_dataset_id, dataset_path, is_local, list_datasets, recording_of, write_dataset
@@ -51,7 +52,7 @@ class RepairReport:
     def __str__(self) -> str:
         lines = [f"{self.dataset_id}: {self.action}, {self.episodes} episodes, {self.steps} steps."]
         kept = [] if self.backup is None else [f"As it was found: {self.backup}"]
-        return "\n  ".join([*lines, *self.notes, *kept])
+        return visible("\n  ".join([*lines, *self.notes, *kept]))
 
 
 def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:

@@ -16,6 +16,8 @@ from pathlib import Path
 
 from mpcoffline.errors import MPCOfflineError
 
+from .bounded import MEMORY, ran_out, run_bounded
+
 logger = logging.getLogger(__name__)
 
 # -ffast-math would set flush-to-zero for the whole process and drop the NaN checks; these do neither. A model's
@@ -122,6 +124,8 @@ def _build(compiler: str, flags: tuple[str, ...], source: str, scratch: Path) ->
     code, built = scratch / "solver.c", scratch / "solver.so"
     code.write_text(source, encoding="utf-8")
     done = _run(compiler, *flags, str(code), "-o", str(built), "-lm")
+    if ran_out(done):
+        raise _too_large(compiler, done.stderr)
     if done.returncode or not built.exists():
         raise _failure(compiler, done.stderr or "no output")
     with built.open("r+b") as file:
@@ -146,13 +150,21 @@ def _remove_abandoned(folder: Path) -> None:
 
 def _run(compiler: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(
-            [compiler, *arguments], capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False
-        )
+        return run_bounded([compiler, *arguments], timeout=_TIMEOUT)
     except subprocess.TimeoutExpired as error:
-        raise _failure(compiler, f"no result after {_TIMEOUT:.0f} s") from error
+        raise _too_large(compiler, "") from error
     except OSError as error:  # e.g. a file that is no program
         raise _failure(compiler, str(error)) from error
+
+
+def _too_large(compiler: str, message: str) -> CompilerError:
+    bounds = f"no result within {_TIMEOUT:.0f} s and {MEMORY >> 30} GiB"
+    return CompilerError(
+        f"C compiler {compiler}",
+        expected="a compiled solver",
+        actual=f"{bounds} {message.strip()[-300:]}".strip(),
+        hint="The model is too large for this compiler: use the solver ipopt, which needs none.",
+    )
 
 
 def _failure(compiler: str, message: str) -> CompilerError:
