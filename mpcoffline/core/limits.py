@@ -30,6 +30,10 @@ EXPRESSION_NODES = 1_000_000
 HORIZON = 10_000
 PLAN_NUMBERS = 1_000_000  # horizon times states and inputs; 64 input sequences are tried
 
+# Of what is compiled: a compiler takes its five minutes for half of this.
+COMPILED_NODES = 100_000  # operations of model and costs
+COMPILED_PRODUCTS = 1_000_000  # of the model's derivatives with the value function's, a step of the Riccati recursion
+
 # Solvers.
 ITERATIONS = 100_000
 THREADS = 1_024

@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 
 from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import MANIFEST_BYTES
+from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError
 
 MANIFEST = "SHA256SUMS"
@@ -36,7 +37,7 @@ class Difference:
     actual: str
 
     def __str__(self) -> str:
-        return f"{self.path}: expected {self.expected}, got {self.actual}"
+        return visible(f"{self.path}: expected {self.expected}, got {self.actual}")
 
 
 def sha256_of(path: Path) -> str:

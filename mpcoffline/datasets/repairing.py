@@ -20,6 +20,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import METADATA_BYTES
+from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError, StorageError, UnknownIdError
 
 from .atomic import publish
@@ -57,7 +58,7 @@ class RepairReport:
     def __str__(self) -> str:
         lines = [f"{self.dataset_id}: {self.action}, {self.episodes} episodes, {self.steps} steps."]
         kept = [] if self.backup is None else [f"As it was found: {self.backup}"]
-        return "\n  ".join([*lines, *self.notes, *kept])
+        return visible("\n  ".join([*lines, *self.notes, *kept]))
 
 
 def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:

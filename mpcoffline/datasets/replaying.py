@@ -12,6 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.checks import check_integers
+from mpcoffline.core.text import visible
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 
 from .minari_store import load_dataset
@@ -77,7 +78,7 @@ class ReplayReport:
 
     def __str__(self) -> str:
         rows = [f"{name}: whole episode {a}, one step {b}, tolerance {c}" for name, a, b, c in self._rows()]
-        return "\n".join([self.headline, *rows, *self._remarks()])
+        return visible("\n".join([self.headline, *rows, *self._remarks()]))
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group
@@ -87,8 +88,8 @@ class ReplayReport:
         table = Table("largest deviation", "whole episode", "one step", "tolerance", box=None, pad_edge=False)
         for row in self._rows():
             table.add_row(*row)
-        headline = Text(self.headline, style="bold green" if self.ok else "bold red")
-        return Group(headline, table, *(Text(line) for line in self._remarks()))
+        headline = Text(visible(self.headline), style="bold green" if self.ok else "bold red")
+        return Group(headline, table, *(Text(visible(line)) for line in self._remarks()))
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         def cell(deviations: Mapping[str, Deviation], name: str) -> str:

@@ -69,7 +69,7 @@ class Summary:
         facts = [f"* {key}: {markdown(value)}" for key, value in self.facts.items()]
         rows = [_HEADER, ("---",) * len(_HEADER), *self._rows()]
         table = ["| " + " | ".join(row) + " |" for row in rows]
-        lines = [self.card or f"# {self.dataset_id}\n", *facts, "", *table]
+        lines = [self.card or f"# {markdown(self.dataset_id)}\n", *facts, "", *table]
         return "\n".join([*lines, "", f"coverage: {self.figure}"] if self.figure is not None else lines)
 
     def __rich__(self) -> RenderableType:

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError
 
 from .manifest import MANIFEST, differences, write_manifest
@@ -53,7 +54,7 @@ class Finding:
         return where if self.step is None else f"{where}, step {self.step}"
 
     def __str__(self) -> str:
-        return f"{'error' if self.serious else 'note'}: {self.check}: {self.place}: {self.message}"
+        return visible(f"{'error' if self.serious else 'note'}: {self.check}: {self.place}: {self.message}")
 
 
 @dataclass(frozen=True)
@@ -90,20 +91,21 @@ class VerifyReport:
         return f"{self.dataset_id}: {verdict}{extra} ({self.episodes} episodes, {self.steps} steps, {hashed})"
 
     def __str__(self) -> str:
-        return "\n".join([self.headline, *(str(finding) for finding in self.findings[:SHOWN]), *self._more()])
+        lines = [self.headline, *(str(finding) for finding in self.findings[:SHOWN]), *self._more()]
+        return visible("\n".join(lines))
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group
         from rich.table import Table
         from rich.text import Text
 
-        headline = Text(self.headline, style="bold green" if self.ok else "bold red")
+        headline = Text(visible(self.headline), style="bold green" if self.ok else "bold red")
         if not self.findings:
             return headline
         table = Table("check", "where", "what", box=None, pad_edge=False)
         for finding in self.findings[:SHOWN]:
             style = "red" if finding.serious else "yellow"
-            table.add_row(Text(finding.check, style=style), Text(finding.place), Text(finding.message))
+            table.add_row(Text(finding.check, style=style), Text(finding.place), Text(visible(finding.message)))
         return Group(headline, table, *(Text(line) for line in self._more()))
 
     def _more(self) -> list[str]:

@@ -48,8 +48,8 @@ class MPC:
             :class:`Constraint` and :class:`StateBounds`, which are named, may be soft, and may hold at the end only.
 
     Raises:
-        InvalidArgumentError: For a horizon that is not positive or above 10,000 steps, a discount outside (0, 1], bounds
-            that cross or have the wrong shape, or costs and constraints that do not fit the model's dimensions.
+        InvalidArgumentError: For a horizon that is not positive or above 10,000 steps, a discount outside (0, 1],
+            bounds that cross or have the wrong shape, or costs and constraints that do not fit the model's dimensions.
     """
 
     model: Model

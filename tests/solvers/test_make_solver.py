@@ -85,7 +85,7 @@ def test_options_that_do_not_exist_or_fit() -> None:
     with pytest.raises(InvalidArgumentError, match="expected options of one solver"):
         make_solver(integrator(), cache_size=3, n_workers=2)
     for n_starts in (0, -1, 65):
-        with pytest.raises(InvalidArgumentError, match="n_starts: expected from 1 to 64"):
+        with pytest.raises(InvalidArgumentError, match="n_starts: expected an integer from 1 to 64"):
             make_solver(integrator(), n_starts=n_starts)
 
 

@@ -20,6 +20,8 @@ from mpcoffline.core.places import cache_folders, open_own, warn_once
 from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.errors import MPCOfflineError, StorageError
 
+from .bounded import MEMORY, ran_out, run_bounded
+
 logger = logging.getLogger(__name__)
 
 # -ffast-math would set flush-to-zero for the whole process and drop the NaN checks; these do neither. A model's
@@ -204,6 +206,8 @@ def _output(compiler: str, flags: tuple[str, ...], source: str, scratch: Path) -
         return built
     if not _has_room(scratch, done.stderr):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(scratch))
+    if ran_out(done):
+        raise _too_large(compiler, done.stderr)
     raise _failure(compiler, done.stderr or "no output")
 
 
@@ -262,23 +266,24 @@ def _run(
     """Runs a compiler; its messages are English, its temporary files in the scratch folder."""
     environment = os.environ | {"LC_ALL": "C"} | ({} if scratch is None else {"TMPDIR": str(scratch)})
     try:
-        return subprocess.run(
-            [*shlex.split(compiler), *arguments],
-            input=source,
-            env=environment,
-            capture_output=True,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=_TIMEOUT,
-            check=False,
-        )
+        bounded = [*shlex.split(compiler), *arguments]
+        return run_bounded(bounded, timeout=_TIMEOUT, source=source, env=environment)
     except subprocess.TimeoutExpired as error:
-        raise _failure(compiler, f"no result after {_TIMEOUT:.0f} s") from error
+        raise _too_large(compiler, "") from error
     except BrokenPipeError as error:  # a program that reads nothing
         raise _failure(compiler, "no output") from error
     except OSError as error:  # e.g. a file that is no program
         raise _failure(compiler, str(error)) from error
+
+
+def _too_large(compiler: str, message: str) -> CompilerError:
+    bounds = f"no result within {_TIMEOUT:.0f} s and {MEMORY >> 30} GiB"
+    return CompilerError(
+        f"C compiler {compiler}",
+        expected="a compiled solver",
+        actual=f"{bounds} {message.strip()[-300:]}".strip(),
+        hint="The model is too large for this compiler: use the solver ipopt, which needs none.",
+    )
 
 
 def _failure(compiler: str, message: str) -> CompilerError:

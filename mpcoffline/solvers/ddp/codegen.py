@@ -9,6 +9,7 @@ from importlib import resources
 import casadi as ca
 import numpy as np
 
+from mpcoffline.core import limits
 from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.expressions import Instruction, expanded
@@ -80,6 +81,7 @@ def generated(mpc: MPC) -> str:
     z = ca.vertcat(x, u)
     reached, cost = mpc.dynamics_function(x, u, theta), mpc.stage_function(x, u, theta)
     final = mpc.terminal_function(x, theta)
+    _check_size(mpc, ca.vertcat(reached, cost, final))
     final_hessian, final_gradient = ca.hessian(final, x)
     hessian, slope = ca.hessian(cost, z)
     linearised = value_and_jacobian(reached, z, theta)
@@ -116,6 +118,23 @@ def generated(mpc: MPC) -> str:
         ),
     ]
     return "\n\n".join(parts)
+
+
+def _check_size(mpc: MPC, functions: ca.SX) -> None:
+    """Refuses what no compiler is through with in minutes, before its derivatives are taken."""
+    dynamics = mpc.dynamics_function
+    derivatives = sum(dynamics.jac_sparsity(0, i).nnz() for i in (0, 1))
+    for what, found, most in (
+        ("operations", ca.n_nodes(functions), limits.COMPILED_NODES),
+        ("products of derivatives", 2 * derivatives * (mpc.nx + mpc.nu), limits.COMPILED_PRODUCTS),
+    ):
+        if found > most:
+            raise InvalidArgumentError(
+                "mpc",
+                expected=f"at most {most} {what} for the ddp solver",
+                actual=f"{found} {what}",
+                hint='Use the solver "ipopt".',
+            )
 
 
 def _action_value(

@@ -1,0 +1,128 @@
+"""Results replace files as a whole, and nothing but files; what cannot be written is refused before the work."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpc_problems import PENDULUM
+
+from mpcoffline import MPCPolicy
+from mpcoffline.archive import write_archive
+from mpcoffline.core.outputs import check_output, check_output_folder, replaced, write_file
+from mpcoffline.errors import StorageError
+from mpcoffline.export import export_c
+from mpcoffline.loggers import CSVLogger
+from mpcoffline.tasks import nominal_mpc
+
+
+def special_files(folder: Path) -> dict[str, Path]:
+    """One of each kind that needs no rights."""
+    made = {name: folder / name for name in ("FIFO", "folder", "socket")}
+    os.mkfifo(made["FIFO"])
+    made["folder"].mkdir()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(made["socket"]))
+    return made | {"device": Path(os.devnull)}
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "file": lambda path: write_file(path, b"new"),
+    "archive": lambda path: write_archive(path, "thing", {}),
+    "logger": CSVLogger,
+    "policy": lambda path: MPCPolicy(nominal_mpc(PENDULUM)).save(path),
+    "check": check_output,
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_what_is_no_file_is_never_replaced(writer: str, tmp_path: Path) -> None:
+    for kind, path in special_files(tmp_path).items():
+        before = os.stat(path)
+        link = tmp_path / f"link to {kind}"
+        link.symlink_to(path)
+        for name in (path, link):
+            with pytest.raises(StorageError, match=f"expected a file or nothing there, got a {kind}"):
+                WRITERS[writer](name)
+        after = os.stat(path)
+        assert (stat.S_IFMT(after.st_mode), after.st_ino) == (stat.S_IFMT(before.st_mode), before.st_ino)
+    assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for target in ("there/old", "there/new"):
+        (tmp_path / "link").unlink(missing_ok=True)
+        (tmp_path / "link").symlink_to(target)
+        write_file(tmp_path / "link", "text °")
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / target).read_text(encoding="utf-8") == "text °"
+
+
+def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(StorageError):
+        write_file(tmp_path / "a", b"")
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (calls.append("fsync"), sync(descriptor)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b)))
+    write_archive(tmp_path / "x.zip", "thing", {}, {"a": np.zeros(3)})
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+def test_an_interruption_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    write_file(tmp_path / "x", b"old")
+
+    def interrupted() -> None:
+        with replaced(tmp_path / "x") as file:
+            file.write(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert (tmp_path / "x").read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["x"]
+
+
+def test_folders_that_take_no_file_are_refused_and_none_is_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError):
+        check_output_folder(tmp_path / "file")
+    with pytest.raises(StorageError):
+        check_output_folder(tmp_path / "file" / "below")
+    with pytest.raises(StorageError, match="No such file"):
+        check_output(tmp_path / "none" / "x")
+    check_output(tmp_path / "none" / "x", make=True)
+    check_output_folder(tmp_path / "none" / "deeper", ("a",))
+    (tmp_path / "out" / "results.json").mkdir(parents=True)
+    with pytest.raises(StorageError, match=r"results\.json"):
+        check_output_folder(tmp_path / "out", ("results.json",))
+    assert sorted(os.listdir(tmp_path)) == ["file", "out"]
+
+
+def test_an_export_is_refused_before_it_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mpcoffline.export.DDPSolver", None)  # which is not asked
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError):
+        export_c(MPCPolicy(nominal_mpc(PENDULUM)), tmp_path / "file")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_read_only_places_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "old").write_text("kept")
+    (tmp_path / "old").chmod(0o400)
+    with pytest.raises(StorageError, match="read-only"):
+        check_output(tmp_path / "old")
+    tmp_path.chmod(0o500)
+    with pytest.raises(StorageError):
+        check_output(tmp_path / "new")

@@ -1,0 +1,95 @@
+"""Names that may stand in files, and text that does no harm where it goes."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mpcoffline.core.text import c_comment, c_identifiers, check_name, check_unit, markdown, markdown_code, visible
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
+
+names = st.text(st.sampled_from("abgφö²ß_.-^*/()%°µ·[], 019Ω日"), min_size=1, max_size=12).filter(str.strip)
+
+
+@pytest.mark.parametrize("name", ["m", "k-1", "stage_cost.W", "m²", "φ", "Länge 2", "N·m/(rad·s)", "W[0,1]", "日本"])
+def test_names_of_the_alphabet(name: str) -> None:
+    assert check_name("name", name) == name
+    assert check_unit("unit", name) == name
+
+
+@pytest.mark.parametrize("unit", ["", "kg", "rad/s", "N m", "kg·m²", "m^2", "s⁻¹", "%", "°", "µs", "Ω"])
+def test_units(unit: str) -> None:
+    assert check_unit("unit", unit) == unit
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        " ",
+        "a\n",
+        "a\x00",
+        "\x1b[2J",
+        'a"',
+        "a'",
+        "a\\",
+        "a?",
+        "a<b",
+        "#a",
+        "a;b",
+        "\u202ea",
+        "\u3164",
+        "a" * 101,
+        5,
+        None,
+    ],
+)
+def test_other_names_are_refused_by_name(name: object) -> None:
+    with pytest.raises(InvalidArgumentError, match="thing: expected") as caught:
+        check_name("thing", name)
+    assert str(caught.value).isprintable()
+    with pytest.raises(FileFormatError):
+        check_name("thing", name, error=FileFormatError)
+
+
+@given(st.lists(names, unique=True, max_size=8))
+def test_identifiers_are_of_c_and_differ(given: list[str]) -> None:
+    found = c_identifiers(given)
+    assert sorted(found) == sorted(given)
+    assert len(set(found.values())) == len(given)
+    assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name, flags=re.ASCII) for name in found.values())
+    assert not any("__" in name for name in found.values())
+
+
+def test_identifiers_keep_what_they_can() -> None:
+    found = c_identifiers(["model.k-1", "model.k_1", "model.m", "model.m²", "model.φ", "int", "co_await", "2x"])
+    assert found["model.k_1"] == "model_k_1"  # the name that is one goes first
+    assert found["model.k-1"] == "model_k_1_2"
+    assert (found["model.m"], found["model.m²"], found["model.φ"]) == ("model_m", "model_m2", "model_u03c6")
+    assert (found["int"], found["co_await"], found["2x"]) == ("p_int", "p_co_await", "p_2x")
+
+
+@given(st.text())
+def test_a_comment_of_c_goes_on_to_its_end(text: str) -> None:
+    comment = c_comment(text)
+    assert not re.search(r"\*/|/\*|\\|\?\?|[\n\r]", comment)
+
+
+@given(st.text())
+def test_nothing_steers_a_terminal(text: str) -> None:
+    shown = visible(text)
+    assert all(c == "\n" or c.isprintable() for c in shown)
+    assert visible(shown) == shown
+
+
+def test_escapes_are_shown_by_their_number() -> None:
+    assert visible("a\x1b[2J\x9b\u202e\n") == "a\\x1b[2J\\x9b\\u202e\n"
+    assert str(InvalidArgumentError("x", expected="y", actual="\x1b]0;title\x07")).isprintable()
+
+
+def test_markdown_stays_text() -> None:
+    assert markdown("a_b _c_ <b> [x](y) | `z`\n# t") == r"a_b \_c\_ \<b\> \[x\](y) \| \`z\` \# t"
+    assert markdown_code("a`b|c") == r"`a'b\|c`"
