@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from heapq import heapify, heappop, heappush
 
@@ -151,7 +152,12 @@ def _applied(graph: _Graph, op: int, operands: list[int], varying: set[int]) -> 
 
 def _derived(op: int, *operands: ca.SX) -> tuple[ca.SX, ...]:
     """The derivatives of any operation by its operands."""
-    symbols = [ca.SX.sym(f"operand{i}") for i in range(len(operands))]
-    value = ca.SX.binary(op, *symbols) if len(symbols) == 2 else ca.SX.unary(op, *symbols)
-    gradients = [ca.densify(ca.jacobian(value, symbol)) for symbol in symbols]
-    return tuple(ca.substitute(gradients, symbols, list(operands)))
+    return tuple(_gradients(op, len(operands)).call(list(operands)))
+
+
+@functools.cache
+def _gradients(op: int, n: int) -> ca.Function:
+    """The derivatives of an operation by its ``n`` operands, as a function of them."""
+    symbols = [ca.SX.sym(f"operand{i}") for i in range(n)]
+    value = ca.SX.binary(op, *symbols) if n == 2 else ca.SX.unary(op, *symbols)
+    return ca.Function("gradients", symbols, [ca.densify(ca.jacobian(value, symbol)) for symbol in symbols])
