@@ -24,13 +24,13 @@ from .honest import LOGS, PACKED, SET, Honest, learner
 
 Read = Callable[[], str]
 FULL = {
-    "policy/bytes": 900, "policy/zip": 300, "policy/json": 1600, "policy/arrays": 100,
-    "learner/bytes": 400, "learner/zip": 100, "learner/json": 900, "learner/arrays": 300,
+    "policy/bytes": 700, "policy/zip": 300, "policy/json": 1300, "policy/arrays": 100,
+    "learner/bytes": 400, "learner/zip": 100, "learner/json": 600, "learner/arrays": 300,
     "checkpoint/bytes": 400, "checkpoint/zip": 100, "checkpoint/json": 300, "checkpoint/arrays": 300,
-    "metadata/bytes": 400, "metadata/json": 500, "metadata without sums/bytes": 300, "metadata without sums/json": 900,
-    "hdf5/bytes": 900, "hdf5/objects": 200, "hdf5 without sums/bytes": 800, "hdf5 without sums/objects": 1100,
-    "sums/bytes": 300, "sums/lines": 300, "log/bytes": 900, "log salvaged/bytes": 500,
-    "table cache/bytes": 700, "table cache/json": 200, "compile cache/bytes": 120,
+    "metadata/bytes": 400, "metadata/json": 500, "metadata without sums/bytes": 300, "metadata without sums/json": 700,
+    "hdf5/bytes": 700, "hdf5/objects": 200, "hdf5 without sums/bytes": 600, "hdf5 without sums/objects": 900,
+    "sums/bytes": 300, "sums/lines": 300, "log/bytes": 700, "log salvaged/bytes": 500,
+    "table cache/bytes": 500, "table cache/json": 200, "compile cache/bytes": 120,
     "packed/bytes": 300, "packed/objects": 300,
 }  # fmt: skip
 X = np.array([0.3, 0.2, -0.1])
