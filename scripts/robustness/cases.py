@@ -244,7 +244,7 @@ def with_progress(outcomes: Iterable[Outcome], total: int) -> list[Outcome]:
     start = said = time.monotonic()
     for outcome in outcomes:
         done.append(outcome)
-        if outcome.kind in BAD:
+        if outcome.kind not in GOOD:
             print(f"  {outcome.kind}: {outcome.name} ({outcome.mutation}) {outcome.detail[:160]}", file=sys.stderr)
         if time.monotonic() - said > 15 or len(done) == total:
             said = time.monotonic()

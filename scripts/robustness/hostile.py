@@ -13,6 +13,8 @@ from .targets import Read
 
 KINDS = {"archives": hostile_archives.FILES, "data sets": hostile_hdf5.FILES, "places": hostile_places.FILES}
 
+SLOW = ("hostile archives/a chain of 10,000 sines",)  # minutes: in the full run alone
+
 
 def all_cases(honest: Honest) -> list[Case]:
     """A case for each; 64 MB count as what an honest file takes."""

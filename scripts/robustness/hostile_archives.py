@@ -203,9 +203,11 @@ def chain(document: Any, length: int, op: str = "sin") -> None:
     function(document)["instructions"] = [line for line in program if line[0] != "output"] + steps + rest
 
 
-@edited("a chain of 10,000 sines", refuse=False)
-def sines(document: Any) -> None:
-    chain(document, 10_000)
+for _length in (1_000, 10_000):
+
+    @edited(f"a chain of {_length:,} sines", refuse=False)
+    def sines(document: Any, length: int = _length) -> None:
+        chain(document, length)
 
 
 @edited("two million nodes")

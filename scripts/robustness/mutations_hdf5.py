@@ -9,14 +9,12 @@ from typing import Any
 import h5py
 import numpy as np
 
-ATTRIBUTE_WAYS = [
+WAYS = [
     "remove", "dtype", "dtype", "shape", "shape", "nan", "fill", "gzip", "chunk", "soft", "hard", "external",
     "raw", "virtual", "group", "move", "extra", "type", "reference", "compound", "text", "vlen", "hollow", "null",
     "big", "alone",
 ]  # fmt: skip
-OBJECT_WAYS = [
-    "set", "set", "set", "remove", "odd",
-]  # fmt: skip
+CHANGES = ["set", "set", "set", "remove", "odd"]
 
 
 def mutated_hdf5(rng: random.Random, path: Path) -> str:
@@ -25,32 +23,36 @@ def mutated_hdf5(rng: random.Random, path: Path) -> str:
         names: list[str] = []
         file.visit(names.append)
         name = rng.choice(names)
-        found = file[name]
         if rng.random() < 0.2:
-            return _attribute(rng, rng.choice((file, found)))
-        way = rng.choice(ATTRIBUTE_WAYS)
-        values = found[()] if isinstance(found, h5py.Dataset) else np.zeros(3)
-        if way == "move":
-            file.move(name, rng.choice((f"{name}x", f"{name}/../other", "episode_99", "x")))
-            return f"{name} {way}"
-        if way == "extra":
-            file.create_dataset(f"{rng.choice(names[:1])}/extra{rng.randrange(99)}", data=np.zeros(3))
-            return f"{way}"
-        others = [other for other in names if other != name and not other.startswith(f"{name}/")]
-        if way == "alone":
-            for other in others:
-                if other in file and not name.startswith(other):
-                    del file[other]
-            return f"{name} {way}"
+            return _attribute(rng, rng.choice((file, file[name])))
+        way = rng.choice(WAYS)
+        try:
+            _changed(rng, file, name, way, names)
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:  # HDF5 does not take it
+            return f"{name} {way} in part ({type(error).__name__})"
+        return f"{name} {way}"
+
+
+def _changed(rng: random.Random, file: Any, name: str, way: str, names: list[str]) -> None:
+    others = [other for other in names if other != name and not other.startswith(f"{name}/")]
+    if way == "move":
+        file.move(name, rng.choice((f"{name}x", "episode_99", "x", f"{names[0]}/x")))
+    elif way == "extra":
+        file.create_dataset(f"{names[0]}/extra", data=np.zeros(3))
+    elif way == "alone":
+        for other in others:
+            if other in file and not name.startswith(other):
+                del file[other]
+    else:
+        values = file[name][()] if isinstance(file[name], h5py.Dataset) else np.zeros(3)
         del file[name]
         if way != "remove":
             _replace(rng, file, name, way, values, others)
-        return f"{name} {way}"
 
 
 def _attribute(rng: random.Random, holder: Any) -> str:
     keys = list(holder.attrs)
-    way = rng.choice(OBJECT_WAYS)
+    way = rng.choice(CHANGES)
     key = rng.choice(keys) if keys and way != "odd" else rng.choice(("id", "seed", "total_steps", "format", "x"))
     if way == "remove" and key in holder.attrs:
         del holder.attrs[key]
