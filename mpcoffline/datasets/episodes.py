@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 RECORDED_INFOS = ("cost", "state")
 
+PIECE_STEPS = 4096  # of a long episode: what a killed process loses at most of the one under way
+
 
 class EpisodeBuilder:
     """Collects the transitions of one episode in memory.
@@ -22,6 +24,9 @@ class EpisodeBuilder:
     Args:
         observation: First observation ``(ny,)``.
         info: The reset's info. Of the infos, ``"cost"`` and ``"state"`` are kept.
+
+    Attributes:
+        returned: The sum of the rewards in the pieces that were taken.
 
     Raises:
         InvalidDataError: For an observation that is not an array of numbers.
@@ -34,10 +39,26 @@ class EpisodeBuilder:
         self._terminations: list[bool] = []
         self._truncations: list[bool] = []
         self._infos = [_kept(info)]
+        self._taken = 0
+        self.returned = 0.0
 
     def __len__(self) -> int:
         """Number of transitions."""
-        return len(self._rewards)
+        return self._taken + len(self._rewards)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether a piece is to be taken before the next transition."""
+        return len(self._rewards) >= PIECE_STEPS
+
+    def take(self) -> EpisodeBuffer:
+        """The transitions since the last piece, which are forgotten; without the row before them but in the first."""
+        piece = self.finish()
+        self._taken = len(self)
+        self.returned += float(np.sum(piece.rewards))
+        self._observations, self._infos = self._observations[-1:], self._infos[-1:]
+        self._actions, self._rewards, self._terminations, self._truncations = [], [], [], []
+        return piece
 
     @property
     def last_observation(self) -> NDArray[Any]:
@@ -77,7 +98,7 @@ class EpisodeBuilder:
         self._infos.append(_kept(info))
 
     def finish(self, *, truncate: bool = False) -> EpisodeBuffer:
-        """The episode as Minari stores it.
+        """The episode, or what comes after its pieces, as Minari stores it.
 
         Args:
             truncate: Marks the last step as truncated unless it terminated.
@@ -88,7 +109,7 @@ class EpisodeBuilder:
         if truncate and truncations and not self._terminations[-1]:
             truncations[-1] = True
         return EpisodeBuffer(
-            observations=np.stack(self._observations),  # type: ignore[arg-type, unused-ignore]
+            observations=np.stack(self._observations[self._taken > 0 :]),  # type: ignore[arg-type, unused-ignore]
             actions=np.stack(self._actions),  # type: ignore[arg-type, unused-ignore]
             rewards=np.array(self._rewards, dtype=np.float64),  # type: ignore[arg-type, unused-ignore]
             terminations=np.array(self._terminations),  # type: ignore[arg-type, unused-ignore]
@@ -103,7 +124,7 @@ class EpisodeBuilder:
             known = next((info[key] for info in reversed(self._infos) if key in info), None)
             if known is not None:
                 missing = np.full_like(known, np.nan)
-                stacked[key] = np.stack([info.get(key, missing) for info in self._infos])
+                stacked[key] = np.stack([info.get(key, missing) for info in self._infos[self._taken > 0 :]])
         return stacked
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 from .checks import floats
 from .episodes import EpisodeBuilder
 from .minari_store import write_dataset
-from .policy_name import policy_name
+from .policy_origin import policy_origin
 from .recording import Recording
 from .transitions import TransitionTable
 
@@ -50,7 +50,8 @@ def record(
     A recording that was interrupted goes on, with a warning, with the episode after the last one finished; with a seed
     the result is the same as without the interruption. It goes on only where it is the same one: the policy (its name
     and its code; not the numbers in it), the environment with its arguments, the seed, and the number of episodes.
-    Another one is kept elsewhere, which a warning says, and recording starts anew.
+    Another one is kept elsewhere, which a warning says, and recording starts anew. Of an episode under way, 4096 steps
+    at most are lost; going on begins it again, while :func:`repair` keeps it as one that was cut off.
 
     Args:
         env: The environment or its id.
@@ -83,26 +84,17 @@ def record(
         mode="replace" if overwrite else "new",
         algorithm_name=algorithm_name or getattr(policy, "__name__", type(policy).__name__),
         description=description,
-        origin={
-            "policy": policy_name(policy),
-            "plant": type(made.unwrapped).__qualname__,
-            "seed": seed,
-            "number of episodes": n_episodes,
-            "deterministic": deterministic,
-        },
+        origin=policy_origin(policy, made, n_episodes, seed, deterministic),
         resume=resume,
         leftover="aside",
+        keep_cut=False,
     )
-    if recording.resumed:
-        warnings.warn(
-            f"record: {recording.resumed} episodes of an interrupted recording of {dataset_id!r} are continued;"
-            " resume=False starts anew.",
-            stacklevel=2,
-        )
+    recording.tell_resumed("record")
     try:
         for number in range(recording.resumed, n_episodes):
             episode_seed = None if seed is None else seed + number
-            recording.append(0, _run(made, policy, number, episode_seed, deterministic), complete=True)
+            episode = _run(made, policy, number, episode_seed, deterministic, partial(recording.append_piece, 0))
+            recording.append(0, episode, complete=True)
         return recording.seal()
     finally:
         recording.close()
@@ -110,7 +102,14 @@ def record(
             made.close()
 
 
-def _run(env: gym.Env[Any, Any], policy: Any, number: int, seed: int | None, deterministic: bool) -> EpisodeBuffer:
+def _run(
+    env: gym.Env[Any, Any],
+    policy: Any,
+    number: int,
+    seed: int | None,
+    deterministic: bool,
+    on_piece: Callable[[EpisodeBuffer], None],
+) -> EpisodeBuffer:
     observation, info = env.reset(seed=seed)
     if seed is not None:
         env.action_space.seed(seed)  # for policies that sample it
@@ -133,6 +132,8 @@ def _run(env: gym.Env[Any, Any], policy: Any, number: int, seed: int | None, det
                 actual=f"{action} of shape {action.shape}",
             )
         observation, reward, terminated, truncated, info = env.step(action)
+        if episode.is_long:
+            on_piece(episode.take())
         episode.add(action, float(reward), observation, terminated=terminated, truncated=truncated, info=info)
         done = terminated or truncated
     return episode.finish()

@@ -6,6 +6,7 @@ import heapq
 import os
 import shutil
 import uuid
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,6 +143,7 @@ class Recording:
             StorageError: Where the disk refuses; what was written before is intact.
         """
         self._log(env).append_piece(LoggedEpisode.of(buffer, self._sequence, complete=False))
+        self.poll()
 
     def _log(self, env: int) -> EpisodeLog:
         self._check_held()
@@ -153,6 +155,15 @@ class Recording:
                 sync_folder(folder)
                 folder = folder.parent
         return self._logs[env]
+
+    def tell_resumed(self, who: str, more: str = "") -> None:
+        """Warns where episodes of an interrupted recording are continued."""
+        if self.resumed:
+            warnings.warn(
+                f"{who}: {self.resumed} episodes of an interrupted recording of {self.dataset_id!r} are continued;"
+                f" resume=False starts anew.{more}",
+                stacklevel=3,
+            )
 
     def poll(self) -> None:
         """Synchronises logs whose time has come."""
