@@ -111,11 +111,16 @@ def replay(
 
 
 @app.command(epilog=examples("mpcoffline datasets repair mine/pendulum/first-v0"))
-def repair(dataset_id: Id) -> None:
+def repair(
+    dataset_id: Id,
+    salvage: Annotated[
+        bool, typer.Option("--salvage", help="Take what is intact of a recording's damaged log, and keep the log.")
+    ] = False,
+) -> None:
     """Finish or rebuild what a killed recording left; what is found is kept as a backup."""
     from mpcoffline.datasets import repair as mend
 
-    say(escape(str(mend(dataset_id))))
+    say(escape(str(mend(dataset_id, salvage=salvage))))
 
 
 @app.command(epilog=examples("mpcoffline datasets download mine/plant/log-v0 --remote hf://my-organisation"))

@@ -15,6 +15,8 @@ from .stage_cost import PlantInfo
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
+PIECE_STEPS = 4096  # of a long episode: what a killed process loses at most of the one under way
+
 
 class EpisodeBuilder:
     """Collects the transitions of one episode in memory.
@@ -23,6 +25,9 @@ class EpisodeBuilder:
         observation: First observation ``(ny,)``.
         info: The reset's info.
         rule: What is taken from infos, the same for all episodes of a recording.
+
+    Attributes:
+        returned: The sum of the rewards in the pieces that were taken.
 
     Raises:
         InvalidDataError: For an observation that is not an array of numbers.
@@ -37,10 +42,27 @@ class EpisodeBuilder:
         self._truncations: list[bool] = []
         self._costs = [rule.first_cost(info)]
         self._states = [rule.state(info, reset=True)]
+        self._taken = 0
+        self.returned = 0.0
 
     def __len__(self) -> int:
         """Number of transitions."""
-        return len(self._rewards)
+        return self._taken + len(self._rewards)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether a piece is to be taken before the next transition."""
+        return len(self._rewards) >= PIECE_STEPS
+
+    def take(self) -> EpisodeBuffer:
+        """The transitions since the last piece, which are forgotten; without the row before them but in the first."""
+        piece = self.finish()
+        self._taken = len(self)
+        self.returned += float(np.sum(piece.rewards))
+        self._observations = self._observations[-1:]
+        self._costs, self._states = self._costs[-1:], self._states[-1:]
+        self._actions, self._rewards, self._terminations, self._truncations = [], [], [], []
+        return piece
 
     @property
     def last_info(self) -> dict[str, Any]:
@@ -89,7 +111,9 @@ class EpisodeBuilder:
         self._truncations.append(truncated)
 
     def finish(self, *, truncate: bool = False) -> EpisodeBuffer:
-        """The episode as Minari stores it; its reward is minus the cost where the info's cost counts.
+        """The episode, or what comes after its pieces, as Minari stores it.
+
+        Its reward is minus the cost where the info's cost counts.
 
         Args:
             truncate: Marks the last step as truncated unless it terminated.
@@ -101,7 +125,7 @@ class EpisodeBuilder:
             truncations[-1] = True
         rewards = [-cost for cost in self._costs[1:]] if self._rule.has_cost else self._rewards
         return EpisodeBuffer(
-            observations=np.stack(self._observations),  # type: ignore[arg-type, unused-ignore]
+            observations=np.stack(self._observations[self._taken > 0 :]),  # type: ignore[arg-type, unused-ignore]
             actions=np.stack(self._actions),  # type: ignore[arg-type, unused-ignore]
             rewards=np.array(rewards, dtype=np.float64),  # type: ignore[arg-type, unused-ignore]
             terminations=np.array(self._terminations),  # type: ignore[arg-type, unused-ignore]
@@ -112,9 +136,10 @@ class EpisodeBuilder:
     def _stacked_infos(self) -> dict[str, NDArray[np.float64]]:
         """The infos that count, ``cost (T+1, 1)`` and ``state (T+1, nx)``; an unknown first row is NaN."""
         stacked = {}
+        rows = slice(int(self._taken > 0), None)
         if self._rule.has_cost:
-            stacked["cost"] = np.array(self._costs, dtype=np.float64)[:, None]
+            stacked["cost"] = np.array(self._costs[rows], dtype=np.float64)[:, None]
         if self._rule.has_state:
             missing = np.full_like(self._states[-1], np.nan, dtype=np.float64)
-            stacked["state"] = np.stack([missing if state is None else state for state in self._states])
+            stacked["state"] = np.stack([missing if state is None else state for state in self._states[rows]])
         return stacked

@@ -26,6 +26,7 @@ from .manifest import MANIFEST, differences, read_manifest, sha256_of, write_man
 from .minari_store import _declare_namespace, check_dataset_id, dataset_path, is_local, load_dataset
 from .opening import open_dataset
 from .recipes import catalog_file
+from .recording_lock import check_not_recorded
 from .remotes import SETTING, Listing, Remote, RemoteError, fetch, open_remote, remote_errors
 from .verification import verify
 
@@ -134,6 +135,7 @@ def download_dataset(
             actual="none",
             hint=f"Set {SETTING}=hf://ORGANISATION (or gcp://BUCKET) to where the data set is, or pass remote=.",
         )
+    check_not_recorded(dataset_id)
     with _download_folder(dataset_id) as folder:
         staged = folder / "dataset"
         if not _is_complete(folder, source):

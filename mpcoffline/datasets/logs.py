@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 from .checks import floats
 from .minari_store import write_dataset
 from .plants import check_spaces, check_units, in_units, opened, plain_spec, step_cap
-from .policy_name import policy_name
+from .policy_origin import policy_origin
 from .recording import Recording
 from .rollouts import run_episode
 from .stage_cost import PlantInfo
@@ -55,7 +55,8 @@ def record(
     A recording that was interrupted goes on, with a warning, with the episode after the last one finished; with a seed
     the result is the same as without the interruption. It goes on only where it is the same one: the policy (its name
     and its code; not the numbers in it), the environment with its arguments, the seed, and the number of episodes.
-    Another one is kept elsewhere, which a warning says, and recording starts anew.
+    Another one is kept elsewhere, which a warning says, and recording starts anew. Of an episode under way, 4096 steps
+    at most are lost; going on begins it again, while :func:`repair` keeps it as one that was cut off.
 
     What is recorded is what the plant sees and pays, in its units: the reward below wrappers that change it, and
     -``info["cost"]`` in its place where the two are the same in float32. Where they are not, that key means something
@@ -108,26 +109,18 @@ def record(
         mode="replace" if overwrite else "new",
         algorithm_name=algorithm_name or getattr(policy, "__name__", type(policy).__name__),
         description=description,
-        origin={
-            "policy": policy_name(policy),
-            "plant": type(made.unwrapped).__qualname__,
-            "seed": first_seed,
-            "number of episodes": int(n_episodes),
-            "deterministic": deterministic,
-        },
+        origin=policy_origin(policy, made, int(n_episodes), first_seed, deterministic),
         resume=resume,
         leftover="aside",
+        keep_cut=False,
     )
-    if recording.resumed:
-        warnings.warn(
-            f"record: {recording.resumed} episodes of an interrupted recording of {dataset_id!r} are continued;"
-            " resume=False starts anew.",
-            stacklevel=2,
-        )
+    recording.tell_resumed("record")
+    on_piece = partial(recording.append_piece, 0)
     try:
         for number in range(recording.resumed, n_episodes):
             episode_seed = None if first_seed is None else first_seed + number
-            recording.append(0, run_episode(made, actor, number, episode_seed, deterministic, rule, cap), complete=True)
+            episode = run_episode(made, actor, number, episode_seed, deterministic, rule, cap, on_piece)
+            recording.append(0, episode, complete=True)
         return recording.seal()
     finally:
         recording.close()

@@ -53,7 +53,8 @@ class MinariRecorder(BaseCallback):
     step marked as truncated. The data set stores the spec of the environment without training wrappers, so
     that ``dataset.recover_environment()`` rebuilds it.
 
-    Every finished episode goes to a log at once, so that a training that is killed loses none of them. The end
+    Every finished episode goes to a log at once, and of a longer one every 4096 steps, so that a training that is
+    killed loses no finished episode and at most 4096 steps of one under way (which counts as cut off there). The end
     of training makes the data set of the logs. After an interruption, recording under the same id again
     goes on with the same logs, and ``mpcoffline.datasets.repair(dataset_id)`` makes the data set of what there is.
 
@@ -162,13 +163,8 @@ class MinariRecorder(BaseCallback):
             sync_episodes=self.sync_episodes,
             sync_seconds=self.sync_seconds,
         )
-        if self._recording.resumed:
-            again = "" if agent.num_timesteps or agent.seed is None else _SAME_SEED.format(agent.seed)
-            warnings.warn(
-                f"MinariRecorder: {self._recording.resumed} episodes of an interrupted recording of"
-                f" {self.dataset_id!r} are continued; resume=False starts anew.{again}",
-                stacklevel=2,
-            )
+        again = "" if agent.num_timesteps or agent.seed is None else _SAME_SEED.format(agent.seed)
+        self._recording.tell_resumed("MinariRecorder", again)
         observations = plants.first_observations(self._before(agent))
         infos = self._first_infos(observations, plants.reset_infos)
         self._running = [EpisodeBuilder(s, info, self._rule) for s, info in zip(observations, infos, strict=True)]
@@ -195,6 +191,8 @@ class MinariRecorder(BaseCallback):
         recording, plants = self._started()
         for i, (info, done) in enumerate(zip(plants.infos, plants.dones, strict=True)):
             truncated = bool(done) and bool(info.get("TimeLimit.truncated", False))
+            if self._running[i].is_long:
+                recording.append_piece(i, self._running[i].take())
             self._running[i].add(
                 plants.actions[i],
                 plants.rewards[i],
@@ -206,7 +204,7 @@ class MinariRecorder(BaseCallback):
             )
             if done:
                 episode = self._running[i].finish()
-                self.returns.append(float(np.sum(episode.rewards)))
+                self.returns.append(self._running[i].returned + float(np.sum(episode.rewards)))
                 recording.append(i, episode, complete=True)
                 # Now, not at the next step: an episode of one step would overwrite the reset info.
                 self._running[i] = EpisodeBuilder(plants.observations[i], plants.reset_infos[i], self._rule)
@@ -220,7 +218,7 @@ class MinariRecorder(BaseCallback):
         for i, builder in enumerate(self._running):
             if len(builder) > 0:
                 episode = builder.finish(truncate=True)
-                self.returns.append(float(np.sum(episode.rewards)))
+                self.returns.append(builder.returned + float(np.sum(episode.rewards)))
                 recording.append(i, episode, complete=False)
         self.dataset = recording.seal()
         self._recording = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import json
 import os
 import shutil
 import uuid
@@ -15,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageError
+from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .atomic import sync_folder
 from .checks import check_storable
-from .episode_log import EpisodeLog, LoggedEpisode, LogHeader, LogIndex, scan
+from .episode_log import EpisodeLog, LogIndex, scan
+from .log_records import LoggedEpisode, LogHeader
 from .minari_store import check_new_dataset, dataset_path, is_local, recording_of, write_dataset
 from .opening import open_dataset
 from .recording_lock import RecordingLock, log_files, recording_path
+from .same_recording import are_continued, check_extends, common_header, origin_json, remove_logs, set_aside
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -46,6 +47,7 @@ class Recording:
             environment, spaces, algorithm and ``origin`` are equal. Another one is an error (``"refuse"``), or is put
             aside with a warning (``"aside"``). ``"restart"`` continues none: the same one is deleted, another one is
             put aside.
+        keep_cut: Whether an episode that a crash cut off, of which pieces were written, stays as one that did not end.
         sync_episodes: See :class:`EpisodeLog`.
         sync_seconds: See :class:`EpisodeLog`.
 
@@ -72,6 +74,7 @@ class Recording:
         origin: Mapping[str, Any] | None = None,
         resume: bool = True,
         leftover: str = "refuse",
+        keep_cut: bool = True,
         sync_episodes: int = 10,
         sync_seconds: float = 5.0,
     ) -> None:
@@ -81,7 +84,11 @@ class Recording:
         check_storable("observation space", observation_space)
         check_storable("action space", action_space)
         self.dataset_id = dataset_id
-        self._settings: dict[str, Any] = {"sync_episodes": sync_episodes, "sync_seconds": sync_seconds}
+        self._settings: dict[str, Any] = {
+            "sync_episodes": sync_episodes,
+            "sync_seconds": sync_seconds,
+            "keep_cut": keep_cut,
+        }
         self._logs: dict[int, EpisodeLog] = {}
         self.header = LogHeader(
             dataset_id,
@@ -92,19 +99,19 @@ class Recording:
             _spec_json(env_spec),
             algorithm_name,
             description,
-            _origin_json(origin),
+            origin_json(origin),
         )
-        _check_extends(self.header)
+        check_extends(self.header)
         self._lock = RecordingLock(dataset_id)
         try:
             if not resume:
-                _remove_logs(dataset_id)
+                remove_logs(dataset_id)
             indices = [scan(path) for path in log_files(dataset_id)]
-            if indices and _are_continued(indices, self.header, leftover):
+            if indices and are_continued(indices, self.header, leftover):
                 self.header = indices[0].header
             else:
                 indices = []
-            self.resumed = sum(len(index.records) for index in indices)
+            self.resumed = sum(len(index.records) - (0 if keep_cut else len(index.cut)) for index in indices)
             self._sequence = max((e.sequence + 1 for index in indices for e in index.episodes()), default=0)
         except BaseException:
             self._lock.release()
@@ -122,6 +129,24 @@ class Recording:
             InvalidArgumentError: After the end, or in a fork of the process that records.
             StorageError: Where the disk refuses; what was written before is intact.
         """
+        self._log(env).append(LoggedEpisode.of(buffer, self._sequence, complete=complete))
+        self._sequence += 1
+
+    def append_piece(self, env: int, buffer: EpisodeBuffer) -> None:
+        """Adds a piece of a long episode that is under way; :meth:`append` adds the last one.
+
+        Args:
+            env: Number of the environment.
+            buffer: The next steps, in pieces but the first without the row before them.
+
+        Raises:
+            InvalidArgumentError: After the end, or in a fork of the process that records.
+            StorageError: Where the disk refuses; what was written before is intact.
+        """
+        self._log(env).append_piece(LoggedEpisode.of(buffer, self._sequence, complete=False))
+        self.poll()
+
+    def _log(self, env: int) -> EpisodeLog:
         self._check_held()
         if env not in self._logs:
             path = self._lock.folder / f"env-{env:04d}.log"
@@ -130,8 +155,16 @@ class Recording:
             while folder != dataset_path("").parent:  # its name, and those of new folders above, on the disk too
                 sync_folder(folder)
                 folder = folder.parent
-        self._logs[env].append(LoggedEpisode.of(buffer, self._sequence, complete=complete))
-        self._sequence += 1
+        return self._logs[env]
+
+    def tell_resumed(self, who: str, more: str = "") -> None:
+        """Warns where episodes of an interrupted recording are continued."""
+        if self.resumed:
+            warnings.warn(
+                f"{who}: {self.resumed} episodes of an interrupted recording of {self.dataset_id!r} are continued;"
+                f" resume=False starts anew.{more}",
+                stacklevel=3,
+            )
 
     def poll(self) -> None:
         """Synchronises logs whose time has come."""
@@ -143,7 +176,7 @@ class Recording:
         self._check_held()
         self._close_logs(finished=True)
         try:
-            return _seal(self.dataset_id)
+            return _seal(self.dataset_id)[0]
         finally:
             self._lock.release()
 
@@ -165,7 +198,7 @@ class Recording:
             log.close(finished=finished)
 
 
-def seal(dataset_id: str) -> MinariDataset:
+def seal(dataset_id: str, *, salvage: bool = False) -> tuple[MinariDataset, list[str], Path | None]:
     """Makes the data set of the logs that a recording left, and removes them.
 
     The data set is built in a hidden folder, written to the disk, and only then named. Sealing that was interrupted
@@ -173,6 +206,10 @@ def seal(dataset_id: str) -> MinariDataset:
 
     Args:
         dataset_id: Minari id under which the episodes were recorded.
+        salvage: Whether to take what is intact of damaged logs; they are then kept as they were.
+
+    Returns:
+        The data set; what is not in it, one sentence each; and where damaged logs are kept.
 
     Raises:
         InvalidArgumentError: Where there is no log, no episode in them, a recorder at work on them, or another
@@ -182,21 +219,23 @@ def seal(dataset_id: str) -> MinariDataset:
     """
     lock = RecordingLock(dataset_id)
     try:
-        return _seal(dataset_id)
+        return _seal(dataset_id, salvage=salvage)
     finally:
         lock.release()
 
 
-def _seal(dataset_id: str) -> MinariDataset:
+def _seal(dataset_id: str, *, salvage: bool = False) -> tuple[MinariDataset, list[str], Path | None]:
     from minari.serialization import deserialize_space
 
-    indices = [scan(path) for path in log_files(dataset_id)]
+    indices, lost = _salvaged(dataset_id) if salvage else ([scan(path) for path in log_files(dataset_id)], [])
     if sum(len(index.records) for index in indices) == 0:
-        _remove_logs(dataset_id)
+        if lost:
+            raise FileFormatError(f"recording of {dataset_id!r}", expected="an intact episode", actual="none")
+        remove_logs(dataset_id)
         raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
-    header = _common_header(indices)
+    header = common_header(indices)
     if recording_of(dataset_id) != header.recording:
-        _check_extends(header)
+        check_extends(header)
         if is_local(dataset_id) and header.mode == "new":
             raise InvalidArgumentError(
                 f"data set {dataset_id!r}",
@@ -224,124 +263,38 @@ def _seal(dataset_id: str) -> MinariDataset:
             building=building,
         )
     dataset = open_dataset(dataset_path(dataset_id))  # first: the logs are all there is if it is damaged
-    _remove_logs(dataset_id)
-    return dataset
+    kept = set_aside(dataset_id) if lost else None
+    remove_logs(dataset_id)
+    return dataset, lost, kept
+
+
+def _salvaged(dataset_id: str) -> tuple[list[LogIndex], list[str]]:
+    """What is intact of the logs, and what is not: damaged bytes, and the numbers of the episodes that are missing."""
+    paths = log_files(dataset_id)
+    header = next((index.header for path in paths if (index := _try_scan(path)) is not None), None)
+    indices = [scan(path, salvage=True, fallback=header) for path in paths]
+    lost: list[str] = []
+    for index in [index for index in indices if header is not None and index.header.recording != header.recording]:
+        lost.append(f"{index.path.name} is left out: it is of another recording.")
+        indices.remove(index)
+    lost += [sentence for index in indices for sentence in index.damage]
+    numbers = sorted(episode.sequence for index in indices for episode in index.episodes())
+    missing = sorted(set(range(max(numbers, default=-1))) - set(numbers)) if lost else []
+    if missing:
+        lost.append(f"Of the episodes in the order in which they ended, these are missing: {missing}.")
+    return indices, lost
+
+
+def _try_scan(path: Path) -> LogIndex | None:
+    try:
+        return scan(path, salvage=True)
+    except FileFormatError:
+        return None
 
 
 def _in_order(indices: list[LogIndex]) -> Iterator[LoggedEpisode]:
     """All logs' episodes in the order in which they ended, one of each log in memory at a time."""
     return heapq.merge(*(index.episodes() for index in indices), key=lambda episode: episode.sequence)
-
-
-def _common_header(indices: list[LogIndex]) -> LogHeader:
-    """The header that the logs share, or an error where they are of different recordings."""
-    first = indices[0].header
-    for index in indices:
-        if index.header.recording != first.recording:
-            raise FileFormatError(
-                f"log {index.path}", expected=f"a log of recording {first.recording}", actual=index.header.recording
-            )
-    return first
-
-
-def _are_continued(indices: list[LogIndex], header: LogHeader, leftover: str) -> bool:
-    """Whether a new recording goes on with these logs; where not, they are out of its way. See :class:`Recording`."""
-    first, name = _common_header(indices), header.dataset_id
-    differences = _differences(first, header)
-    if not differences and leftover != "restart" and first.recording != recording_of(name):
-        return True
-    found = sum(len(index.records) for index in indices)
-    if found == 0 or first.recording == recording_of(name):
-        _remove_logs(name)
-    elif not differences:
-        _remove_logs(name)
-        warnings.warn(f"{found} episodes of an interrupted recording of {name!r} are recorded anew.", stacklevel=3)
-    elif leftover == "refuse":
-        what, theirs, ours = differences[0]
-        raise InvalidArgumentError(
-            what,
-            expected=f"that of the interrupted recording of {name!r}: {theirs}",
-            actual=ours,
-            hint=f"Seal it first (`mpcoffline datasets repair {name}`), or pass resume=False.",
-        )
-    else:
-        kept = _set_aside(name)
-        because = "; ".join(f"{what} {theirs}, now {ours}" for what, theirs, ours in differences)
-        warnings.warn(
-            f"An interrupted recording of {name!r} is another one ({because}): it is not continued."
-            f" Its {found} episodes are kept in {kept}.",
-            stacklevel=3,
-        )
-    return False
-
-
-def _differences(first: LogHeader, second: LogHeader) -> list[tuple[str, str, str]]:
-    """In what two recordings of one id are not the same: what, in the first, in the second."""
-    pairs: dict[str, tuple[Any, Any]] = {
-        "observation space": (first.observation_space, second.observation_space),
-        "action space": (first.action_space, second.action_space),
-        "environment": _plants(first.env_spec, second.env_spec),
-        "algorithm": (first.algorithm_name, second.algorithm_name),
-        "extends a data set": (first.mode == "extend", second.mode == "extend"),
-    }
-    theirs, ours = (json.loads(header.origin or "{}") for header in (first, second))
-    # The plant's class is not known where it is in another process.
-    keys = {*theirs, *ours} - ({"plant"} if "plant" not in theirs or "plant" not in ours else set())
-    pairs |= {key: (theirs.get(key), ours.get(key)) for key in sorted(keys)}
-    return [(what, str(a), str(b)) for what, (a, b) in pairs.items() if a != b]
-
-
-def _check_extends(header: LogHeader) -> None:
-    """Refuses a recording that is to extend the data set of another plant, which stays as it is."""
-    if header.mode != "extend" or not is_local(header.dataset_id):
-        return
-    stored = json.loads((dataset_path(header.dataset_id) / "data" / "metadata.json").read_text(encoding="utf-8"))
-    pairs = {
-        "environment": _plants(stored.get("env_spec"), header.env_spec),
-        "observation space": (stored.get("observation_space"), header.observation_space),
-        "action space": (stored.get("action_space"), header.action_space),
-    }
-    for what, (theirs, ours) in pairs.items():
-        if theirs != ours:
-            raise InvalidArgumentError(
-                f"{what} of what extends data set {header.dataset_id!r}",
-                expected=f"that of the data set: {theirs}",
-                actual=str(ours),
-                hint="One data set holds one plant: record another plant under another id, with a recorder of its own.",
-            )
-
-
-def _plants(first: str | None, second: str | None) -> tuple[str | None, str | None]:
-    """Two specs as short as they can be told apart: id and arguments, or all of it."""
-    try:
-        found = [None if spec is None else json.loads(spec) for spec in (first, second)]
-        short = [None if spec is None else f"{spec['id']} with {spec['kwargs']}" for spec in found]
-    except (ValueError, TypeError, KeyError):
-        return first, second
-    return (short[0], short[1]) if (short[0] == short[1]) == (first == second) else (first, second)
-
-
-def _set_aside(dataset_id: str) -> Path:
-    """Moves the logs to where nobody continues them; moved back, they can be repaired."""
-    number = 0
-    while (kept := dataset_path("") / ".broken" / f"{dataset_id}-recording-{number}").exists():
-        number += 1
-    try:
-        kept.mkdir(parents=True)
-        for path in log_files(dataset_id):
-            path.rename(kept / path.name)
-    except OSError as error:
-        raise StorageError.of(kept, error) from error
-    return kept
-
-
-def _remove_logs(dataset_id: str) -> None:
-    for path in log_files(dataset_id):
-        path.unlink()
-
-
-def _origin_json(origin: Mapping[str, Any] | None) -> str | None:
-    return None if origin is None else json.dumps(origin, sort_keys=True, default=str)
 
 
 def _spec_json(spec: EnvSpec | None) -> str | None:

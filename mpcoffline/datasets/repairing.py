@@ -40,7 +40,8 @@ class RepairReport:
 
     Attributes:
         dataset_id: Minari id.
-        action: ``"sealed"`` (the data set was made of a recording's logs), ``"rebuilt"`` (of the readable
+        action: ``"sealed"`` (the data set was made of a recording's logs), ``"salvaged"`` (of what is intact of them),
+            ``"rebuilt"`` (of the readable
             episodes of its HDF5 file), or ``"intact"`` (nothing was to be done).
         episodes: Number of episodes that the data set has now.
         steps: Number of transitions that the data set has now.
@@ -61,7 +62,7 @@ class RepairReport:
         return visible("\n  ".join([*lines, *self.notes, *kept]))
 
 
-def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:
+def repair(dataset_id: str, *, env_spec: EnvSpec | None = None, salvage: bool = False) -> RepairReport:
     """Makes a data set readable again: from the logs of its recording, or from what its HDF5 file still holds.
 
     Repairs what a killed recorder leaves (logs that are not sealed), and what a killed Minari leaves (an empty
@@ -74,6 +75,8 @@ def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:
     Args:
         dataset_id: Minari id.
         env_spec: Spec of the environment, where the metadata that knew it are lost.
+        salvage: Whether to take what is intact of logs that are damaged, which are refused otherwise. The notes say
+            what is missing; the logs are kept.
 
     Raises:
         InvalidArgumentError: For a malformed id, or a recorder at work on it.
@@ -91,8 +94,9 @@ def repair(dataset_id: str, *, env_spec: EnvSpec | None = None) -> RepairReport:
                 actual=f"a damaged one in {dataset_path(dataset_id)}",
                 hint="Move that folder away, then repair again: the recording takes its place.",
             )
-        dataset = seal(dataset_id)
-        return RepairReport(dataset_id, "sealed", int(dataset.total_episodes), int(dataset.total_steps))
+        sealed, lost, kept = seal(dataset_id, salvage=salvage)
+        counts = int(sealed.total_episodes), int(sealed.total_steps)
+        return RepairReport(dataset_id, "salvaged" if lost else "sealed", *counts, tuple(lost), kept)
     if recording_path(dataset_id).exists():
         RecordingLock(dataset_id).release()  # an empty recording: only its folder is left
     if not dataset_path(dataset_id).is_dir():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -26,6 +27,7 @@ def run_episode(
     deterministic: bool,
     rule: PlantInfo,
     cap: int,
+    on_piece: Callable[[EpisodeBuffer], None],
 ) -> EpisodeBuffer:
     """Runs a policy until the episode ends.
 
@@ -37,6 +39,10 @@ def run_episode(
         deterministic: Passed to ``predict``.
         rule: What counts of the infos.
         cap: Steps after which the episode is one without end.
+        on_piece: Takes the pieces of a long episode, but the last.
+
+    Returns:
+        The episode, or its last piece.
 
     Raises:
         InvalidArgumentError: For an action outside the action space, an episode without end, wrappers that rescale, or
@@ -70,6 +76,8 @@ def run_episode(
             observation, given, terminated, truncated, info = env.step(action)
             check_unchanged(env, watch, action, observation)
             given = reward_of(f"episode {number}, step {len(episode)}", given)
+            if episode.is_long:
+                on_piece(episode.take())
             paid = given if watch.reward is None else watch.reward
             episode.add(
                 *(action, paid, observation),

@@ -1,10 +1,25 @@
-"""Which policy it was: a name that a recording keeps, so that it is continued with the same one only."""
+"""What makes a recording of a policy this one and no other, so that it is continued by the same one only."""
 
 from __future__ import annotations
 
 import zlib
 from types import CodeType
 from typing import Any
+
+import gymnasium as gym
+
+
+def policy_origin(
+    policy: Any, env: gym.Env[Any, Any], n_episodes: int, seed: int | None, deterministic: bool
+) -> dict[str, Any]:
+    """The policy, the plant, and the arguments on which the episodes depend, by the names that messages use."""
+    return {
+        "policy": policy_name(policy),
+        "plant": type(env.unwrapped).__qualname__,
+        "number of episodes": n_episodes,
+        "seed": seed,
+        "deterministic": deterministic,
+    }
 
 
 def policy_name(policy: Any) -> str:
