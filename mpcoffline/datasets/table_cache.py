@@ -15,7 +15,7 @@ import shutil
 import tempfile
 import weakref
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from mpcoffline.errors import FileFormatError, StorageError
 
 from .atomic import publish
+from .centring import Centring
 from .manifest import sha256_of
 
-VERSION = 1
+VERSION = 2
 READ_BYTES = 1 << 18
 _ROWS, _IDS, _META = "rows.f32", "episodes.i64", "table.json"
 
@@ -41,6 +42,7 @@ class TableFile:
     Attributes:
         ny: Number of observation coordinates.
         nu: Number of action coordinates.
+        centring: What the rows are packed without.
         rows: The rows ``(n, 2 ny + nu + 2)``, mapped.
         episode_ids: The episode of each row ``(n,)``, mapped.
         block_rows: Number of rows in a block.
@@ -58,10 +60,13 @@ class TableFile:
             self.ny, self.nu, n = int(meta["ny"]), int(meta["nu"]), int(meta["rows"])
             self.block_rows, self._crcs = int(meta["block_rows"]), [int(crc) for crc in meta["crcs"]]
             self._ids_crc = int(meta["ids_crc"])
+            self.centring = Centring.from_json(meta["centring"])
             self._fd = os.open(folder / _ROWS, os.O_RDONLY | os.O_CLOEXEC)
             weakref.finalize(self, os.close, self._fd)
             shape = (n, 2 * self.ny + self.nu + 2)
             self.row_bytes = 4 * shape[1]
+            if (self.centring.centre.shape, self.centring.increments.shape) != ((shape[1],), (self.ny,)):
+                raise ValueError("centres of another width")
             sizes = (os.fstat(self._fd).st_size, (folder / _IDS).stat().st_size)
             if sizes != (n * self.row_bytes, 8 * n) or len(self._crcs) != -(-n // self.block_rows):
                 raise ValueError(f"files of {sizes} bytes for {n} rows")
@@ -123,14 +128,21 @@ class TableFile:
         )
 
 
-def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> None:
-    """Writes a table into an empty folder.
+def write_table(
+    folder: Path,
+    ny: int,
+    nu: int,
+    blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    centring: Centring | None = None,
+) -> None:
+    """Writes a table into a folder of its own.
 
     Args:
         folder: The folder.
         ny: Number of observation coordinates.
         nu: Number of action coordinates.
         blocks: Packed rows ``(B, 2 ny + nu + 2)`` and their episodes ``(B,)``.
+        centring: What they are packed without; nothing by default.
 
     Raises:
         StorageError: Where the disk refuses.
@@ -156,17 +168,25 @@ def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[A
                 ids_crc = zlib.crc32(ids_view, ids_crc)
         if room < block_bytes:
             crcs.append(crc)
-        meta = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
+        meta: dict[str, Any] = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
         meta |= {"block_rows": block_bytes // row_bytes, "ids_crc": ids_crc}
+        meta["centring"] = (centring or Centring.none(ny, nu)).to_json()
         (folder / _META).write_text(json.dumps({**meta, "crcs": crcs}), encoding="utf-8")
     except OSError as error:
         raise StorageError.of(folder, error) from error
 
 
 def cached_table(
-    key: str, ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path
+    key: str,
+    ny: int,
+    nu: int,
+    blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    cache: Path,
+    again: Callable[[], tuple[Iterable[tuple[NDArray[Any], NDArray[Any]]], Centring] | None] = lambda: None,
 ) -> TableFile:
     """The table of that key, written now if the cache does not hold it (intact).
+
+    Once the blocks are written, ``again`` says whether the same rows, centred, should take their place.
 
     Raises:
         StorageError: Where the disk refuses; the cache is as it was.
@@ -179,6 +199,8 @@ def cached_table(
     building = _scratch_folder(cache)
     try:
         write_table(building, ny, nu, blocks)
+        if (better := again()) is not None:
+            write_table(building, ny, nu, *better)
         try:
             publish(building, target, overwrite=False)
         except OSError:
@@ -191,7 +213,13 @@ def cached_table(
         shutil.rmtree(building, ignore_errors=True)
 
 
-def scratch_table(ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path) -> TableFile:
+def scratch_table(
+    ny: int,
+    nu: int,
+    blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    cache: Path,
+    centring: Centring | None = None,
+) -> TableFile:
     """A table in files that have no name any more, so that they vanish with their last user.
 
     Raises:
@@ -199,7 +227,7 @@ def scratch_table(ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray
     """
     folder = _scratch_folder(cache)
     try:
-        write_table(folder, ny, nu, blocks)
+        write_table(folder, ny, nu, blocks, centring)
         return TableFile(folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
