@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.datasets.transitions import Columns, TransitionTable
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman import BellmanFit
+from mpcoffline.learning.bellman import BellmanFit, variance_of
 from mpcoffline.learning.identification import increments_scale
 from mpcoffline.mpc import MPC
 
@@ -134,7 +134,7 @@ def fit_errors(
     """
     sample = _sample(table, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
-    unit = float(sample.costs.var(dtype=np.float64)) or 1.0
+    unit = variance_of(sample.costs)
     before, after = (
         _residuals(BellmanFit(mpc, value, unit), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)

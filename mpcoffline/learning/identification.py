@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.checks import check_integers, check_number
 from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.errors import InvalidDataError
 from mpcoffline.mpc import MPC
 
 from .coordinates import Coordinates
@@ -181,16 +182,24 @@ class OneStepProblem:
                 residuals(z)
             return slopes[z.tobytes()]
 
-        found = scipy.optimize.least_squares(
-            residuals,
-            np.clip(start, self.low, self.high),
-            jac=derivative,
-            bounds=(self.low, self.high),
-            max_nfev=max_iterations,
-            xtol=1e-10,
-            ftol=1e-12,
-            gtol=1e-12,
-        )
+        try:
+            found = scipy.optimize.least_squares(
+                residuals,
+                np.clip(start, self.low, self.high),
+                jac=derivative,
+                bounds=(self.low, self.high),
+                max_nfev=max_iterations,
+                xtol=1e-10,
+                ftol=1e-12,
+                gtol=1e-12,
+            )
+        except (ValueError, np.linalg.LinAlgError) as error:  # squares of the derivative overflow
+            raise InvalidDataError(
+                "identification",
+                expected="data on which the model's prediction has finite derivatives",
+                actual=f"states up to {np.abs(self.rows.x).max():g} ({error})",
+                hint="Are the data in the model's units?",
+            ) from error
         return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
 
 

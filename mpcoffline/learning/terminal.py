@@ -111,7 +111,8 @@ def fit_terminal(
         config: Size of the network and schedule.
 
     Returns:
-        A :class:`~mpcoffline.QuadraticCost` or a :class:`~mpcoffline.NetworkCost`; :func:`terminal_error` says how
+        A :class:`~mpcoffline.QuadraticCost` or a :class:`~mpcoffline.NetworkCost` (the former also where V does not
+        vary); :func:`terminal_error` says how
         close it is.
 
     Raises:
@@ -130,7 +131,7 @@ def fit_terminal(
     states = states[np.sort(rng.permutation(len(states))[: config.max_rows])]
     targets = _values(value, states)
     W, constant = _fit_quadratic(states, reference, targets)
-    if kind == "quadratic":
+    if kind == "quadratic" or targets.std() <= _FLAT * np.abs(targets).max():  # a constant has nothing for a network
         return QuadraticCost(W, x_ref=reference, constant=constant)
 
     e = states - reference
