@@ -236,19 +236,19 @@ def box_from_json(data: Mapping[str, Any]) -> spaces.Box:
     dtype = np.dtype(data["dtype"])
     if dtype.name not in _BOX_TYPES:
         raise FileFormatError("space", expected=f"a Box of {', '.join(_BOX_TYPES)}", actual=str(dict(data)))
-    kinds: tuple[type, ...] = (float, int)
+    kinds: set[type] = {float, int}
     least, most = -math.inf, math.inf
     if dtype.kind in "iu":
-        kinds, least, most = (int,), int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+        kinds, least, most = {int}, int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
     elif dtype.kind == "b":
-        kinds, least, most = (bool,), False, True
+        kinds, least, most = {bool}, False, True
     bounds = [[none if v is None else v for v in data[name]] for name, none in (("low", least), ("high", most))]
     fits = all(type(v) in kinds for side in bounds for v in side) and len(bounds[0]) == len(bounds[1])
     if not fits or not all(least <= a <= b <= most for a, b in zip(*bounds, strict=True)):
         raise FileFormatError("space", expected=f"a Box of {dtype} with low <= high", actual=str(dict(data)))
     with np.errstate(over="ignore"):  # what a small type cannot hold is no bound
         low, high = (np.array(side, dtype=dtype) for side in bounds)
-    space: spaces.Box = spaces.Box(low, high, dtype=dtype.type)
+        space: spaces.Box = spaces.Box(low, high, dtype=dtype.type)
     space.bounded_below &= np.array([v is not None for v in data["low"]])
     space.bounded_above &= np.array([v is not None for v in data["high"]])
     return space

@@ -187,7 +187,7 @@ class Fit:
         terminal_cost = fit_terminal(
             kind,
             value if potential is None else lambda s: value(s) - potential(s),
-            table.observations[_some_rows(len(table), _TERMINAL_ROWS)],
+            table.take(_some_rows(len(table), _TERMINAL_ROWS)).observations,
             x_ref=goal,
             blend=config.terminal_blend,
             seed=self._seed,
@@ -210,7 +210,7 @@ class Fit:
             "seed": self._seed,
         }
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        for column in (self._table.rows, self._table.episode_ids):
+        for column in (self._table.rows, self._table.episode_ids, *self._table.centring):
             digest.update(np.ascontiguousarray(column).data)
         if self.value_function is not None:
             for array in self.value_function.to_arrays().values():

@@ -5,6 +5,7 @@ An error names column, episode and step.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,18 +19,49 @@ NUMBERS = "fiub"  # the kinds of numpy types that a recording can hold
 
 def floats(name: str, column: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
     """The values as float64 with ``ndim`` dimensions, or an ``InvalidDataError``."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidDataError(f"{name}: {column}", expected="an array of numbers", actual=str(error)) from error
+    array = real_numbers(name, column, values)
     if array.ndim != ndim:
         shape = "(n,)" if ndim == 1 else "(n, columns)"
         raise InvalidDataError(f"{name}: {column}", expected=f"shape {shape}", actual=str(array.shape))
     return array
 
 
+def real_numbers(name: str, column: str, values: ArrayLike) -> NDArray[np.float64]:
+    """The values as float64, or an ``InvalidDataError`` for what are no real numbers, or are masked.
+
+    Truth values are numbers (0 and 1) everywhere but among the costs.
+    """
+    _refuse_masks(name, column, values)
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
+        raise InvalidDataError(f"{name}: {column}", expected="an array of numbers", actual=str(error)) from error
+    if array.dtype.kind not in ("fiu" if column.startswith("cost") else "fiub"):
+        raise InvalidDataError(
+            f"{name}: {column}",
+            expected="an array of numbers",
+            actual=f"an array of {array.dtype}",
+            hint="Convert it to float64, which says what is meant.",
+        )
+    return array.astype(np.float64, copy=False)
+
+
+def _refuse_masks(name: str, column: str, values: object) -> None:
+    """Refuses them: numpy would go on with what lies beneath a mask."""
+    parts = values if isinstance(values, (list, tuple)) else [values]
+    n_masked = sum(np.count_nonzero(part.mask) for part in parts if isinstance(part, np.ma.MaskedArray))
+    if n_masked:
+        raise InvalidDataError(
+            f"{name}: {column}",
+            expected="numbers",
+            actual=f"{n_masked} masked entries",
+            hint="Remove these transitions, or fill in what is missing.",
+        )
+
+
 def checked_episode_ids(name: str, values: ArrayLike, length: int) -> NDArray[np.int64]:
     """The ids as int64 ``(length,)``, or an ``InvalidDataError``, also where an id comes again after another."""
+    _refuse_masks(name, "episode_ids", values)
     ids = np.asarray(values)
     if ids.shape != (length,) or not np.issubdtype(ids.dtype, np.integer):
         raise InvalidDataError(
@@ -114,3 +146,39 @@ def check_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
             actual=f"{type(values).__name__} of type {array.dtype} and shape {array.shape}",
         )
     return array
+
+
+def check_sizes(name: str, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Refuses numbers of coordinates that are not those of the MPC: found and wanted, by what they count."""
+    for kind, (found, wanted) in sizes.items():
+        if found != wanted:
+            raise InvalidDataError(
+                f"{name}: {kind}",
+                expected=f"{wanted} coordinates, as in the MPC",
+                actual=str(found),
+                hint="Is this data set of the same task as the MPC?",
+            )
+
+
+def check_bounds(
+    name: str,
+    actions: NDArray[np.floating[Any]],
+    episode_ids: NDArray[np.int64],
+    low: ArrayLike | None,
+    high: ArrayLike | None,
+) -> None:
+    """Refuses the first action beyond the MPC's bounds by more than rounding; None is no bound."""
+    for bound, sign, word in ((low, -1.0, "above"), (high, 1.0, "below")):
+        if bound is None:
+            continue
+        limit = np.broadcast_to(np.asarray(bound, dtype=np.float64), actions.shape[1:])
+        excess = sign * (actions.astype(np.float64) - limit)
+        outside = excess > 1e-6 * np.maximum(1.0, np.abs(limit))
+        if outside.any():
+            row, column = (int(i) for i in np.argwhere(outside)[0])
+            raise InvalidDataError(
+                f"{name}, {place(episode_ids, row)}: action {column}",
+                expected=f"a value {word} the MPC's bound {limit[column]:g}",
+                actual=f"{actions[row, column]:g} ({int(outside.any(axis=1).sum())} such rows)",
+                hint="Check the units, and that the MPC's bounds are those of the plant.",
+            )

@@ -33,8 +33,9 @@ def to_dict(data: Data) -> dict[str, NDArray[Any]]:
 
     Returns:
         ``observations (n, ny)``, ``actions (n, nu)``, ``rewards (n,)`` = -cost, ``costs (n,)``,
-        ``next_observations (n, ny)``, all float32; ``terminals (n,)`` and ``timeouts (n,)``, boolean: whether an
-        episode terminated there, or ended without; ``episode_ids (n,)``, int64. All are copies.
+        ``next_observations (n, ny)``, all float32, or float64 where that is too coarse; ``terminals (n,)`` and
+        ``timeouts (n,)``, boolean: whether an episode terminated there, or ended without; ``episode_ids (n,)``, int64.
+        All are copies.
     """
     table = TransitionTable.of(data)
     costs = table.costs.copy()
@@ -187,24 +188,23 @@ def to_d3rlpy(data: Data) -> Any:
     table = TransitionTable.of(data)
     ends = np.flatnonzero((table.terminations > 0.0) | _timeouts(table)) + 1
     starts = np.concatenate([[0], ends[:-1]])
-    episodes = [
-        WholeEpisode(
-            observations=table.observations[start:end].copy(),
-            actions=table.actions[start:end].copy(),
-            rewards=-table.costs[start:end, None],
-            terminated=bool(table.terminations[end - 1] > 0.0),
-            last_observation=table.next_observations[end - 1].copy(),
+    episodes = []
+    for start, end in zip(starts, ends, strict=True):
+        columns = table.columns(table.rows[start:end])
+        episode = WholeEpisode(
+            observations=columns.observations.copy(),
+            actions=columns.actions.copy(),
+            rewards=-columns.costs[:, None],
+            terminated=bool(columns.terminations[-1] > 0.0),
+            last_observation=columns.next_observations[-1].copy(),
         )
-        for start, end in zip(starts, ends, strict=True)
-    ]
+        episodes.append(episode)
     return create_infinite_replay_buffer(episodes=episodes, transition_picker=LastTransitionPicker())
 
 
 def _timeouts(table: TransitionTable) -> NDArray[np.bool_]:
     """Where a run of rows ends without terminating, ``(n,)``: the next row does not go on from it."""
-    follows = (table.episode_ids[1:] == table.episode_ids[:-1]) & (
-        table.next_observations[:-1] == table.observations[1:]
-    ).all(axis=1)
+    follows = (table.episode_ids[1:] == table.episode_ids[:-1]) & table.goes_on()
     last = np.concatenate([~follows, [True]])
     return np.asarray(last & (table.terminations == 0.0))
 

@@ -18,13 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from mpcoffline.checks import check_integers, checked_seed
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
-from .checks import floats
+from .checks import floats, real_numbers
 from .minari_store import write_dataset
 from .plants import check_spaces, check_units, in_units, opened, plain_spec, step_cap
 from .policy_origin import policy_origin
 from .recording import Recording
 from .rollouts import run_episode
 from .stage_cost import PlantInfo
+from .table_arrays import types_that_hold
 from .transitions import TransitionTable
 from .watching import plant_of
 
@@ -140,6 +141,9 @@ def dataset_from_arrays(
 ) -> MinariDataset:
     """Stores trajectories as a Minari data set.
 
+    Observations and actions are stored as float32, or as float64 where they are small against their offset (a position
+    at 1e6 m), so that float32 would lose their changes.
+
     Args:
         dataset_id: Minari id of the new data set.
         episodes: For each episode its observations ``(T+1, ny)``, actions ``(T, nu)`` and costs ``(T,)``.
@@ -161,13 +165,15 @@ def dataset_from_arrays(
     if len(ends) != len(checked):
         raise InvalidArgumentError("terminated", expected=f"{len(checked)} values", actual=str(len(ends)))
     ny, nu = checked[0][0].shape[1], checked[0][1].shape[1]
-    low, high = (np.broadcast_to(np.asarray(b, np.float32), (nu,)).copy() for b in (action_low, action_high))
     for i, (s, a, _) in enumerate(checked):
         if (s.shape[1], a.shape[1]) != (ny, nu):
             raise InvalidDataError(
                 f"episode {i}", expected=f"{ny} observations and {nu} actions", actual=f"{s.shape[1]}, {a.shape[1]}"
             )
-        outside = (a.astype(np.float32) < low) | (a.astype(np.float32) > high)
+    state_type, action_type = types_that_hold(checked)
+    low, high = (np.broadcast_to(np.asarray(b, action_type), (nu,)).copy() for b in (action_low, action_high))
+    for i, (_, a, _) in enumerate(checked):
+        outside = (a.astype(action_type) < low) | (a.astype(action_type) > high)
         if outside.any():
             step, column = (int(k) for k in np.argwhere(outside)[0])
             raise InvalidDataError(
@@ -177,10 +183,13 @@ def dataset_from_arrays(
             )
     return write_dataset(
         dataset_id,
-        (_episode(s, a, cost, end) for (s, a, cost), end in zip(checked, ends, strict=True)),
+        (
+            _episode(s.astype(state_type), a.astype(action_type), s, cost, end)
+            for (s, a, cost), end in zip(checked, ends, strict=True)
+        ),
         env_spec=None,
-        observation_space=spaces.Box(-np.inf, np.inf, (ny,), np.float32),
-        action_space=spaces.Box(low, high, (nu,), np.float32),
+        observation_space=spaces.Box(-np.inf, np.inf, (ny,), state_type),
+        action_space=spaces.Box(low, high, (nu,), action_type),
         description=description,
         overwrite=overwrite,
     )
@@ -211,17 +220,19 @@ def _checked(
     return s, a, cost
 
 
-def _episode(s: NDArray[Any], a: NDArray[Any], cost: NDArray[Any], terminated: bool) -> EpisodeBuffer:
+def _episode(
+    observations: NDArray[Any], actions: NDArray[Any], state: NDArray[Any], cost: NDArray[Any], terminated: bool
+) -> EpisodeBuffer:
     from minari.data_collector import EpisodeBuffer
 
-    last = np.arange(len(a)) == len(a) - 1
+    last = np.arange(len(actions)) == len(actions) - 1
     columns: dict[str, Any] = {
-        "observations": s.astype(np.float32),
-        "actions": a.astype(np.float32),
+        "observations": observations,
+        "actions": actions,
         "rewards": -cost,
         "terminations": last & terminated,
         "truncations": last & (not terminated),
-        "infos": {"cost": np.concatenate([[0.0], cost])[:, None], "state": s},
+        "infos": {"cost": np.concatenate([[0.0], cost])[:, None], "state": state},
     }
     return EpisodeBuffer(**columns)
 
@@ -293,7 +304,9 @@ def from_csv(
     if len(goes_on) == 0:
         raise InvalidDataError(name, expected="two rows of one episode", actual=f"{len(values)} rows in as many")
     s, a = values[:, :ny], values[:, ny : ny + nu]
-    costs = values[goes_on, -1] if isinstance(cost, str) else np.asarray(cost(s[goes_on], a[goes_on]), np.float64)
+    costs = (
+        values[goes_on, -1] if isinstance(cost, str) else real_numbers(name, "cost(s, a)", cost(s[goes_on], a[goes_on]))
+    )
     if costs.shape != goes_on.shape or not np.isfinite(costs).all():
         bad = costs.shape == goes_on.shape
         where = f", line {lines[goes_on[np.flatnonzero(~np.isfinite(costs))[0]]]}" if bad else ""

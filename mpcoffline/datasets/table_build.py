@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.errors import FileFormatError, InvalidDataError, StorageError
 
+from .centring import Centring, Digits
 from .checks import check_finite
 from .hdf5_episodes import EpisodeColumns, read_episodes
 from .opening import DATA_FILE, check_stored
@@ -28,12 +29,13 @@ Rows = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 
 class BuiltRows(NamedTuple):
-    """A table in memory: packed rows ``(n, 2 ny + nu + 2)``, the episode of each ``(n,)``, and their sizes."""
+    """A table in memory: packed rows ``(n, 2 ny + nu + 2)``, the episode of each ``(n,)``, sizes and centring."""
 
     rows: NDArray[np.float32]
     episode_ids: NDArray[np.int64]
     ny: int
     nu: int
+    centring: Centring
 
 
 def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path | None) -> BuiltRows | TableFile:
@@ -57,33 +59,63 @@ def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path | No
         raise InvalidDataError(name, expected="at least one episode", actual="none")
     mapped = steps * 4 * (2 * ny + nu + 2) > memory
     path = _hdf5_file(dataset)
+    source = _Source(dataset, name, ny, nu)
     if mapped and path is None:
-        return scratch_table(ny, nu, row_blocks(dataset, name, ny, nu), table_folder(cache))
+        file = scratch_table(ny, nu, source.blocks(), table_folder(cache))
+        again = source.again()
+        return file if again is None else scratch_table(ny, nu, again[0], table_folder(cache), again[1])
     if path is not None and (mapped or steps >= CACHED_ROWS):
         cache = table_folder(cache)
         try:
-            file = _cached(dataset, name, ny, nu, path, cache)
+            file = _cached(source, path, cache)
             if mapped:
                 return file
-            return _loaded(file) or BuiltRows(*_cached(dataset, name, ny, nu, path, cache).load(), ny, nu)
+            return _loaded(file) or _in_memory(_cached(source, path, cache))
         except StorageError as error:
             if mapped:
                 raise
             warnings.warn(f"The table is not kept in the cache. {error}", stacklevel=4)
-    return BuiltRows(*_assemble(name, row_blocks(dataset, name, ny, nu), steps, 2 * ny + nu + 2), ny, nu)
+    rows, ids = _assemble(name, source.blocks(), steps, 2 * ny + nu + 2)
+    again = source.again()
+    if again is None:
+        return BuiltRows(rows, ids, ny, nu, Centring.none(ny, nu))
+    return BuiltRows(*_assemble(name, again[0], steps, 2 * ny + nu + 2), ny, nu, again[1])
 
 
-def _cached(dataset: MinariDataset, name: str, ny: int, nu: int, path: Path, cache: Path) -> TableFile:
-    indices = np.asarray(dataset.episode_indices)
-    whole = len(indices) == dataset.storage.total_episodes and bool((np.diff(indices) == 1).all())
+class _Source:
+    """The packed rows of a data set, as they are, and then perhaps again, centred."""
+
+    def __init__(self, dataset: MinariDataset, name: str, ny: int, nu: int) -> None:
+        self.dataset, self.ny, self.nu = dataset, ny, nu
+        self._name, self._digits = name, Digits(ny, nu)
+
+    def blocks(self) -> Iterator[Rows]:
+        self._digits = Digits(self.ny, self.nu)
+        return row_blocks(self.dataset, self._name, self.ny, self.nu, digits=self._digits)
+
+    def again(self) -> tuple[Iterator[Rows], Centring] | None:
+        """The rows centred, where those that were read lost digits."""
+        centring = self._digits.centring
+        if centring.is_none:
+            return None
+        return row_blocks(self.dataset, self._name, self.ny, self.nu, centring=centring), centring
+
+
+def _cached(source: _Source, path: Path, cache: Path) -> TableFile:
+    indices = np.asarray(source.dataset.episode_indices)
+    whole = len(indices) == source.dataset.storage.total_episodes and bool((np.diff(indices) == 1).all())
     key = content_key(path, None if whole else indices, cache)
-    return cached_table(key, ny, nu, row_blocks(dataset, name, ny, nu), cache)
+    return cached_table(key, source.ny, source.nu, source.blocks(), cache, source.again)
+
+
+def _in_memory(file: TableFile) -> BuiltRows:
+    return BuiltRows(*file.load(), file.ny, file.nu, file.centring)
 
 
 def _loaded(file: TableFile) -> BuiltRows | None:
     """The table in memory; None, and the file is gone, where it is damaged."""
     try:
-        return BuiltRows(*file.load(), file.ny, file.nu)
+        return _in_memory(file)
     except FileFormatError as error:
         warnings.warn(f"{error} It is built again.", stacklevel=5)
         shutil.rmtree(file.folder, ignore_errors=True)
@@ -121,10 +153,29 @@ def _assemble(
     return rows, ids
 
 
-def row_blocks(dataset: MinariDataset, name: str, ny: int, nu: int, block_bytes: int = BLOCK_BYTES) -> Iterator[Rows]:
+def row_blocks(
+    dataset: MinariDataset,
+    name: str,
+    ny: int,
+    nu: int,
+    block_bytes: int = BLOCK_BYTES,
+    *,
+    centring: Centring | None = None,
+    digits: Digits | None = None,
+) -> Iterator[Rows]:
     """Yields the packed rows ``(B, 2 ny + nu + 2)`` of a data set and their episodes ``(B,)``, in its order.
 
-    The arrays are used again for the next block. Their size, ``block_bytes`` at most, bounds the memory needed.
+    The arrays are used again for the next block. Their size, ``block_bytes`` at most, bounds the memory needed (thrice
+    that where the data are of more digits than float32 has).
+
+    Args:
+        dataset: The data set.
+        name: What error messages call it.
+        ny: Number of observation coordinates.
+        nu: Number of action coordinates.
+        block_bytes: Size of a block.
+        centring: What the rows are packed without; nothing by default.
+        digits: Is shown what packing does to the numbers.
 
     Raises:
         InvalidDataError: For episodes that do not hold one observation more than actions, other shapes,
@@ -134,25 +185,50 @@ def row_blocks(dataset: MinariDataset, name: str, ny: int, nu: int, block_bytes:
     width = 2 * ny + nu + 2
     size = max(1, block_bytes // (4 * width + 8))
     rows, ids = np.empty((size, width), dtype=np.float32), np.empty(size, dtype=np.int64)
+    exact: NDArray[np.float64] | None = None  # a second copy, only where float32 may lose digits
+    costs = np.empty(size)
     filled, before = 0, 0
+
+    def block() -> Rows:
+        if exact is not None:
+            with np.errstate(over="ignore"):
+                rows[:filled] = exact[:filled]
+        check_finite(name, rows[:filled], ny, nu, ids[:filled], before)
+        if exact is not None and digits is not None:
+            digits.add(exact[:filled], rows[:filled])
+        elif digits is not None:
+            digits.add_costs(costs[:filled], rows[:filled, ny + nu])
+        if exact is not None and centring is not None:
+            rows[:filled] = centring.packed(exact[:filled])
+        return rows[:filled], ids[:filled]
+
     for episode_id, columns in _episodes(dataset):
         where = f"{name}, episode {episode_id}"
         _check_shapes(where, columns, ny, nu)
+        if exact is None and (centring is not None or _is_wide(columns)):
+            exact = np.empty((size, width))
+            exact[:filled] = rows[:filled]
+            exact[:filled, ny + nu] = costs[:filled]
         steps, done = len(columns.actions), 0
         while done < steps:
             count = min(steps - done, size - filled)
             if filled == 0:
                 before = done
-            _pack(rows[filled : filled + count], columns, done, ny, nu)
-            ids[filled : filled + count] = episode_id
+            part = slice(filled, filled + count)
+            _pack((rows if exact is None else exact)[part], columns, done, ny, nu)
+            np.negative(columns.rewards[done : done + count], out=costs[part], casting="same_kind")
+            ids[part] = episode_id
             filled, done = filled + count, done + count
             if filled == size:
-                check_finite(name, rows, ny, nu, ids, before)
-                yield rows, ids
+                yield block()
                 filled = 0
     if filled:
-        check_finite(name, rows[:filled], ny, nu, ids[:filled], before)
-        yield rows[:filled], ids[:filled]
+        yield block()
+
+
+def _is_wide(columns: EpisodeColumns) -> bool:
+    """Whether observations or actions may have more digits than float32 has."""
+    return not all(np.can_cast(part.dtype, np.float32) for part in (columns.observations, columns.actions))
 
 
 def _episodes(dataset: MinariDataset) -> Iterator[tuple[int, EpisodeColumns]]:
@@ -165,7 +241,7 @@ def _episodes(dataset: MinariDataset) -> Iterator[tuple[int, EpisodeColumns]]:
         yield int(episode.id), EpisodeColumns(*(np.asarray(part) for part in parts))
 
 
-def _pack(rows: NDArray[np.float32], columns: EpisodeColumns, start: int, ny: int, nu: int) -> None:
+def _pack(rows: NDArray[np.floating[Any]], columns: EpisodeColumns, start: int, ny: int, nu: int) -> None:
     """Writes the steps from ``start`` on into ``rows``; the one place where a reward becomes a cost."""
     end, after = start + len(rows), ny + nu + 1
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused

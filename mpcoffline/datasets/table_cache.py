@@ -14,7 +14,7 @@ import os
 import shutil
 import weakref
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,10 @@ from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.errors import FileFormatError, StorageError
 
 from .atomic import publish
+from .centring import Centring
 from .manifest import sha256_of
 
-VERSION = 1
+VERSION = 2
 READ_BYTES = 1 << 18
 _ROWS, _IDS, _META = "rows.f32", "episodes.i64", "table.json"
 
@@ -46,6 +47,7 @@ class TableFile:
     Attributes:
         ny: Number of observation coordinates.
         nu: Number of action coordinates.
+        centring: What the rows are packed without.
         raw_rows: The rows ``(n, 2 ny + nu + 2)`` as they are in the file, mapped; :attr:`rows` are checked.
         raw_ids: The episode of each ``(n,)``, likewise.
         block_rows: Number of rows in a block.
@@ -70,6 +72,9 @@ class TableFile:
             weakref.finalize(self, os.close, self._fd)
             shape = (n, 2 * self.ny + self.nu + 2)
             self.row_bytes = 4 * shape[1]
+            self.centring = Centring.from_json(meta["centring"])
+            if (self.centring.centre.shape, self.centring.increments.shape) != ((shape[1],), (self.ny,)):
+                raise ValueError("centres of another width")
             with os.fdopen(open_own(folder / _IDS), "rb") as ids_file, os.fdopen(os.dup(self._fd), "rb") as rows_file:
                 sizes = (os.fstat(self._fd).st_size, os.fstat(ids_file.fileno()).st_size)
                 if sizes != (n * self.row_bytes, 8 * n) or len(self._crcs) != -(-n // self.block_rows):
@@ -168,14 +173,21 @@ class TableFile:
         )
 
 
-def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> None:
-    """Writes a table into an empty folder.
+def write_table(
+    folder: Path,
+    ny: int,
+    nu: int,
+    blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    centring: Centring | None = None,
+) -> None:
+    """Writes a table into a folder of its own.
 
     Args:
         folder: The folder.
         ny: Number of observation coordinates.
         nu: Number of action coordinates.
         blocks: Packed rows ``(B, 2 ny + nu + 2)`` and their episodes ``(B,)``.
+        centring: What they are packed without; nothing by default.
 
     Raises:
         StorageError: Where the disk refuses.
@@ -201,8 +213,9 @@ def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[A
                 ids_crc = zlib.crc32(ids_view, ids_crc)
         if room < block_bytes:
             crcs.append(crc)
-        meta = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
+        meta: dict[str, Any] = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
         meta |= {"block_rows": block_bytes // row_bytes, "ids_crc": ids_crc}
+        meta["centring"] = (centring or Centring.none(ny, nu)).to_json()
         (folder / _META).write_text(json.dumps({**meta, "crcs": crcs}), encoding="utf-8")
         for name in (_ROWS, _IDS, _META):
             (folder / name).chmod(0o600)  # whatever the umask: see open_own
@@ -211,9 +224,16 @@ def write_table(folder: Path, ny: int, nu: int, blocks: Iterable[tuple[NDArray[A
 
 
 def cached_table(
-    key: str, ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path
+    key: str,
+    ny: int,
+    nu: int,
+    blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    cache: Path,
+    again: Callable[[], tuple[Iterable[tuple[NDArray[Any], NDArray[Any]]], Centring] | None] = lambda: None,
 ) -> TableFile:
     """The table of that key, written now if the cache does not hold it (intact).
+
+    Once the blocks are written, ``again`` says whether the same rows, centred, should take their place.
 
     Raises:
         StorageError: Where the disk refuses; the cache is as it was.
@@ -228,6 +248,8 @@ def cached_table(
     with _scratch_folder(cache) as building:
         try:
             write_table(building, ny, nu, blocks)
+            if (better := again()) is not None:
+                write_table(building, ny, nu, *better)
             try:
                 publish(building, target, overwrite=False)
             except OSError:
@@ -240,14 +262,20 @@ def cached_table(
     return file
 
 
-def scratch_table(ny: int, nu: int, blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]], cache: Path) -> TableFile:
+def scratch_table(
+    ny: int,
+    nu: int,
+    blocks: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    cache: Path,
+    centring: Centring | None = None,
+) -> TableFile:
     """A table in files that have no name any more, so that they vanish with their last user.
 
     Raises:
         StorageError: Where the disk refuses.
     """
     with _scratch_folder(cache) as folder:
-        write_table(folder, ny, nu, blocks)
+        write_table(folder, ny, nu, blocks, centring)
         file = TableFile(folder)
     file.folder = cache / folder.parent.name
     return file

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,52 +47,87 @@ class TableStatistics(NamedTuple):
     high: Columns
 
 
-def episodes_by_continuity(rows: NDArray[np.float32], ny: int, nu: int) -> NDArray[np.int64]:
-    """Numbers of the episodes ``(n,)`` of packed rows: a row goes on where the one before ended, unless terminated."""
+def split(block: Any, ny: int, nu: int) -> Columns:
+    """The five columns of a block ``(B, 2 ny + nu + 2)``, as views of it."""
     after = ny + nu + 1
-    goes_on = (rows[:-1, after : after + ny] == rows[1:, :ny]).all(axis=1) & (rows[:-1, after + ny] == 0.0)
-    return np.concatenate([[0], np.cumsum(~goes_on)]).astype(np.int64)
+    return Columns(
+        block[:, :ny],
+        block[:, ny : ny + nu],
+        block[:, ny + nu],
+        block[:, after : after + ny],
+        block[:, after + ny],
+    )
 
 
-def moments(rows: NDArray[np.float32]) -> tuple[Floats, Floats, Floats, Floats]:
+class Moments:
+    """Mean and sum of squares about it of some columns, block by block.
+
+    Args:
+        size: Number of columns.
+
+    Attributes:
+        count: Rows so far.
+        mean: ``(size,)``.
+        squares: ``(size,)``.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.count, self.mean, self.squares = 0, np.zeros(size), np.zeros(size)
+
+    def add(self, block: Floats) -> None:
+        """Takes in rows ``(B, size)``, by the update of Chan, Golub and LeVeque: a large mean does not cancel."""
+        difference, n, count = block.mean(axis=0) - self.mean, len(block), self.count
+        self.squares += block.var(axis=0) * n + difference**2 * count * n / (count + n)
+        self.mean, self.count = self.mean + difference * n / (count + n), count + n
+
+
+def moments(
+    rows: NDArray[np.float32], values: Callable[[NDArray[np.float32]], Floats]
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Mean, standard deviation, smallest and largest value of each column, in one pass.
 
     Args:
         rows: ``(n, width)``, n >= 1.
+        values: From a block of packed rows to its values in float64.
 
     Returns:
         Four arrays ``(width,)``.
     """
-    mean, squares, count = np.zeros(rows.shape[1]), np.zeros(rows.shape[1]), 0
+    found = Moments(rows.shape[1])
     low, high = np.full(rows.shape[1], np.inf), np.full(rows.shape[1], -np.inf)
     for i in range(0, len(rows), CHUNK):
-        block = rows[i : i + CHUNK].astype(np.float64)
-        # The update of Chan, Golub and LeVeque, which does not cancel where the mean is large.
-        difference, n = block.mean(axis=0) - mean, len(block)
-        squares += block.var(axis=0) * n + difference**2 * count * n / (count + n)
-        mean, count = mean + difference * n / (count + n), count + n
+        block = values(rows[i : i + CHUNK])
+        found.add(block)
         low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
-    return mean, np.sqrt(squares / count), low, high
+    return found.mean, np.sqrt(found.squares / found.count), low, high
 
 
-def innermost(rows: NDArray[np.float32], ny: int, nu: int, fraction: float) -> NDArray[np.intp]:
+def innermost(
+    rows: NDArray[np.float32],
+    ny: int,
+    nu: int,
+    fraction: float,
+    states: Callable[[NDArray[np.float32]], tuple[Any, Any]] | None = None,
+) -> NDArray[np.intp]:
     """The ``fraction`` of rows with the smallest max(|s / med|, |s+ / med|), med as :func:`magnitudes` gives it.
 
     Args:
-        rows: The packed rows ``(n, 2 ny + nu + 2)``.
+        rows: The packed rows ``(n, 2 ny + nu + 2)``; where they are centred, it is the distance from the centre.
         ny: Number of observation coordinates.
         nu: Number of action coordinates.
         fraction: In (0, 1].
+        states: From a block of centred rows to s and s+, ``(B, ny)`` each, both from the centre.
 
     Returns:
         Their numbers, ascending.
     """
-    scale, after = magnitudes(rows, ny), ny + nu + 1
+    scale = magnitudes(rows, ny)
     score = np.empty(len(rows))
     for i in range(0, len(rows), CHUNK):
-        block = np.abs(rows[i : i + CHUNK])
+        block = rows[i : i + CHUNK]
+        s, s_next = split(block, ny, nu)[::3] if states is None else states(block)
         # float64: ratios of float32 numbers can overflow.
-        reached = np.maximum(block[:, :ny], block[:, after : after + ny]).astype(np.float64)
+        reached = np.maximum(np.abs(s), np.abs(s_next)).astype(np.float64)
         score[i : i + CHUNK] = (reached / scale).max(axis=1)
     kept = max(1, round(fraction * len(rows)))
     # Stable, so that ties are broken by order and the result does not depend on the machine.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from mpcoffline.checks import check_integers
 from mpcoffline.errors import InvalidArgumentError, InvalidDataError
 
-from .checks import check_finite, checked_episode_ids, floats, place
+from .centring import Centring
+from .checks import check_bounds, check_sizes
 from .sampler import block_batches, gather_batches
-from .table_build import read_minari
+from .table_arrays import read_arrays
+from .table_build import BuiltRows, read_minari
 from .table_cache import TableFile, default_memory, scratch_table
-from .table_math import CHUNK, Columns, TableStatistics, episodes_by_continuity, innermost, moments
+from .table_math import CHUNK, Columns, TableStatistics, innermost, moments, split
 
 __all__ = ["Columns", "TableStatistics", "TransitionTable"]
 
@@ -27,6 +29,10 @@ if TYPE_CHECKING:
 
 class TransitionTable:
     """Transitions (s, a, L, s+, terminated) as one C-contiguous float32 array ``(n, 2 ny + nu + 2)``.
+
+    :attr:`rows` and :meth:`batches` are that array, for speed; everything else is in units. Columns that are small
+    against their offset, as a position at 1e6 m, are packed without it (:mod:`mpcoffline.datasets.centring`), and come
+    out in float64; all others are float32 views of the rows.
 
     One packed row a transition makes a random minibatch one contiguous gather a row, an order of magnitude
     faster than gathering five arrays. Everything here speaks cost L; a reward changes its sign in
@@ -41,6 +47,7 @@ class TransitionTable:
         nu: Number of action coordinates.
         episode_ids: Episode of each row, ``(n,)``; rows of an episode are contiguous and in time order.
         name: What error messages call this table, e.g. the data set's id.
+        centring: What the rows were packed without; nothing by default.
         file: Where the rows are a memory map, the file that they are in.
         memory: Bytes that sampling a mapped table may occupy; a quarter of the machine's memory by default.
     """
@@ -53,10 +60,12 @@ class TransitionTable:
         episode_ids: NDArray[np.int64],
         name: str = "table",
         *,
+        centring: Centring | None = None,
         file: TableFile | None = None,
         memory: int | None = None,
     ) -> None:
         self._rows, self.ny, self.nu, self._episode_ids, self.name = rows, ny, nu, episode_ids, name
+        self.centring = Centring.none(ny, nu) if centring is None else centring
         self._file, self._memory = file, memory
 
     @property
@@ -81,29 +90,30 @@ class TransitionTable:
         return f"TransitionTable({self.name!r}, n={len(self)}, ny={self.ny}, nu={self.nu})"
 
     @property
-    def observations(self) -> NDArray[np.float32]:
-        """Observations s, a view ``(n, ny)``."""
-        return cast("NDArray[np.float32]", self.columns(self.rows).observations)
+    def observations(self) -> NDArray[np.floating[Any]]:
+        """Observations s ``(n, ny)``: a view, or where they are centred a copy in float64."""
+        return self._part(0, self.ny)
 
     @property
-    def actions(self) -> NDArray[np.float32]:
-        """Actions a in the environment's units, a view ``(n, nu)``."""
-        return cast("NDArray[np.float32]", self.columns(self.rows).actions)
+    def actions(self) -> NDArray[np.floating[Any]]:
+        """Actions a in the environment's units ``(n, nu)``, a view or a copy as :attr:`observations`."""
+        return self._part(self.ny, self.nu)
 
     @property
-    def costs(self) -> NDArray[np.float32]:
-        """The stage cost L(s, a), a view ``(n,)``."""
-        return cast("NDArray[np.float32]", self.columns(self.rows).costs)
+    def costs(self) -> NDArray[np.floating[Any]]:
+        """The stage cost L(s, a) ``(n,)``, a view or a copy as :attr:`observations`."""
+        return self._part(self.ny + self.nu, 1)[:, 0]
 
     @property
-    def next_observations(self) -> NDArray[np.float32]:
-        """Observations s+ reached, a view ``(n, ny)``."""
-        return cast("NDArray[np.float32]", self.columns(self.rows).next_observations)
+    def next_observations(self) -> NDArray[np.floating[Any]]:
+        """Observations s+ reached ``(n, ny)``, a view or a copy as :attr:`observations`."""
+        s_next, increments = self._part(self.ny + self.nu + 1, self.ny), self.centring.increments
+        return s_next.astype(np.float64) + increments * self.observations if increments.any() else s_next
 
     @property
     def terminations(self) -> NDArray[np.float32]:
         """1.0 where the episode terminated in s+, else 0.0, a view ``(n,)``."""
-        return cast("NDArray[np.float32]", self.columns(self.rows).terminations)
+        return self.rows[:, -1]
 
     @property
     def n_episodes(self) -> int:
@@ -111,20 +121,36 @@ class TransitionTable:
         return len(np.unique(self.episode_ids))
 
     def columns(self, block: Any) -> Columns:
-        """The five columns of a block of rows (a minibatch, or all rows) as views.
+        """The five columns of a block of rows (a minibatch, or all rows) in units.
+
+        Views of it, but where the table is centred, copies in float64.
 
         Args:
             block: ``(B, 2 ny + nu + 2)``, a numpy array or a torch tensor.
         """
-        ny, nu = self.ny, self.nu
-        after = ny + nu + 1
-        return Columns(
-            block[:, :ny],
-            block[:, ny : ny + nu],
-            block[:, ny + nu],
-            block[:, after : after + ny],
-            block[:, after + ny],
+        return self.centring.columns(block)
+
+    def values(self) -> Columns:
+        """All five columns in units, copies in float64."""
+        return split(self.centring.values(self.rows), self.ny, self.nu)
+
+    def take(self, rows: NDArray[np.intp] | slice) -> TransitionTable:
+        """A table in memory of some of the rows, in the order given."""
+        return TransitionTable(
+            self.rows[rows], self.ny, self.nu, self.episode_ids[rows], self.name, centring=self.centring
         )
+
+    def with_states(self, observations: ArrayLike, next_observations: ArrayLike) -> TransitionTable:
+        """A table in memory with other s and s+, ``(n, ny)`` each, packed as this one is."""
+        values = self.centring.values(self.rows)
+        columns = split(values, self.ny, self.nu)
+        columns.observations[:], columns.next_observations[:] = observations, next_observations
+        rows = self.centring.packed(values)
+        return TransitionTable(rows, self.ny, self.nu, self.episode_ids, self.name, centring=self.centring)
+
+    def goes_on(self) -> NDArray[np.bool_]:
+        """Whether a row's s+ is the s of the next, ``(n - 1,)``; where centred, but for the last digits of float32."""
+        return self.centring.goes_on(self.rows)
 
     @classmethod
     def from_arrays(
@@ -154,30 +180,8 @@ class TransitionTable:
             InvalidDataError: For a wrong shape, lengths that differ, no row at all, NaN or inf (in float32),
                 or terminations that are not boolean.
         """
-        s, a = floats(name, "observations", observations, 2), floats(name, "actions", actions, 2)
-        cost, s_next = floats(name, "costs", costs, 1), floats(name, "next_observations", next_observations, 2)
-        terminated = floats(name, "terminations", terminations, 1)
-        others = {"actions": a, "costs": cost, "next_observations": s_next, "terminations": terminated}
-        for column, array in others.items():
-            if len(array) != len(s):
-                raise InvalidDataError(
-                    f"{name}: {column}", expected=f"{len(s)} rows, as in observations", actual=str(len(array))
-                )
-        if len(s) == 0:
-            raise InvalidDataError(name, expected="at least one transition", actual="none")
-        if s_next.shape != s.shape:
-            raise InvalidDataError(f"{name}: next_observations", expected=f"shape {s.shape}", actual=str(s_next.shape))
-        ids = None if episode_ids is None else checked_episode_ids(name, episode_ids, len(s))
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf and is refused below
-            parts = [s, a, cost[:, None], s_next, terminated[:, None]]
-            rows = np.concatenate(parts, axis=1, dtype=np.float32)
-        check_finite(name, rows, s.shape[1], a.shape[1], ids)
-        if not np.isin(terminated, (0.0, 1.0)).all():
-            raise InvalidDataError(
-                f"{name}: terminations", expected="booleans", actual=f"values such as {terminated.max()}"
-            )
-        ny, nu = s.shape[1], a.shape[1]
-        return cls(rows, ny, nu, episodes_by_continuity(rows, ny, nu) if ids is None else ids, name)
+        columns = observations, actions, costs, next_observations, terminations
+        return cls._built(read_arrays(name, *columns, episode_ids), name)
 
     @classmethod
     def of(cls, data: TransitionTable | MinariDataset | str) -> TransitionTable:
@@ -225,7 +229,7 @@ class TransitionTable:
         built = read_minari(dataset, name, memory, None if cache is None else Path(cache))
         if isinstance(built, TableFile):
             return cls._of_file(built, name, memory)
-        return cls(built.rows, built.ny, built.nu, built.episode_ids, name)
+        return cls._built(built, name)
 
     @classmethod
     def concat(cls, tables: Sequence[TransitionTable], *, name: str | None = None) -> TransitionTable:
@@ -242,7 +246,6 @@ class TransitionTable:
         if not tables:
             raise InvalidArgumentError("tables", expected="at least one", actual="none")
         first = tables[0]
-        blocks, offset = [], 0
         for table in tables:
             if (table.ny, table.nu) != (first.ny, first.nu):
                 raise InvalidDataError(
@@ -250,30 +253,39 @@ class TransitionTable:
                     expected=f"{first.ny} observations and {first.nu} actions, as in {first.name}",
                     actual=f"{table.ny} and {table.nu}",
                 )
+        centring = Centring.common([table.centring for table in tables], [len(table) for table in tables])
+        blocks, offset = [], 0
+        for table in tables:
             episodes, numbers = np.unique(table.episode_ids, return_inverse=True)
             blocks += [
-                (table.rows[i : i + CHUNK], numbers[i : i + CHUNK] + offset) for i in range(0, len(table), CHUNK)
+                (centring.repacked(table.rows[i : i + CHUNK], table.centring), numbers[i : i + CHUNK] + offset)
+                for i in range(0, len(table), CHUNK)
             ]
             offset += len(episodes)
         label = name or " + ".join(table.name for table in tables)
-        return next((table for table in tables if table.is_mapped), first).rewritten(blocks, label)
+        return next((table for table in tables if table.is_mapped), first).rewritten(blocks, label, centring)
 
     def rewritten(
-        self, blocks: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]], name: str | None = None
+        self,
+        blocks: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]],
+        name: str | None = None,
+        centring: Centring | None = None,
     ) -> TransitionTable:
         """A table of other rows, and of their size: a mapped one gives a mapped one, in a file that vanishes with it.
 
         Args:
             blocks: Packed rows ``(B, 2 ny + nu + 2)`` and their episodes ``(B,)``, one block after another.
             name: What error messages call it; the name of this one by default.
+            centring: What they are packed without; as in this one by default.
 
         Raises:
             StorageError: Where a mapped table cannot be written.
         """
+        centring = centring or self.centring
         if self._file is None:
             rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-            return TransitionTable(rows, self.ny, self.nu, ids, name or self.name)
-        file = scratch_table(self.ny, self.nu, blocks, self._file.folder.parent)
+            return TransitionTable(rows, self.ny, self.nu, ids, name or self.name, centring=centring)
+        file = scratch_table(self.ny, self.nu, blocks, self._file.folder.parent, centring)
         return self._of_file(file, name or self.name, self._memory)
 
     def check_fits(
@@ -295,28 +307,8 @@ class TransitionTable:
             InvalidDataError: Naming what differs; for an action out of bounds (beyond float32
                 rounding) its episode and step.
         """
-        for kind, found, wanted in (("observations", self.ny, ny), ("actions", self.nu, nu)):
-            if found != wanted:
-                raise InvalidDataError(
-                    f"{self.name}: {kind}",
-                    expected=f"{wanted} coordinates, as in the MPC",
-                    actual=str(found),
-                    hint="Is this data set of the same task as the MPC?",
-                )
-        for bound, sign, word in ((action_low, -1.0, "above"), (action_high, 1.0, "below")):
-            if bound is None:
-                continue
-            limit = np.broadcast_to(np.asarray(bound, dtype=np.float64), (self.nu,))
-            excess = sign * (self.actions.astype(np.float64) - limit)
-            outside = excess > 1e-6 * np.maximum(1.0, np.abs(limit))
-            if outside.any():
-                row, column = (int(i) for i in np.argwhere(outside)[0])
-                raise InvalidDataError(
-                    f"{self.name}, {place(self.episode_ids, row)}: action {column}",
-                    expected=f"a value {word} the MPC's bound {limit[column]:g}",
-                    actual=f"{self.actions[row, column]:g} ({int(outside.any(axis=1).sum())} such rows)",
-                    hint="Check the units, and that the MPC's bounds are those of the plant.",
-                )
+        check_sizes(self.name, {"observations": (self.ny, ny), "actions": (self.nu, nu)})
+        check_bounds(self.name, self.actions, self.episode_ids, action_low, action_high)
 
     def trim(self, fraction: float) -> TransitionTable:
         """Drops the transitions farthest out, on which a value regression would spend itself.
@@ -335,11 +327,11 @@ class TransitionTable:
         """
         if not 0.0 < fraction <= 1.0:
             raise InvalidArgumentError("fraction", expected="a number in (0, 1]", actual=str(fraction))
-        return self._take(innermost(self.rows, self.ny, self.nu, fraction))
+        return self._take(innermost(self.rows, self.ny, self.nu, fraction, self.centring.states))
 
     def statistics(self) -> TableStatistics:
         """Mean, standard deviation and range of every column, in float64, in one pass over the table."""
-        return TableStatistics(*(self._row(values) for values in moments(self.rows)))
+        return TableStatistics(*(self._row(values) for values in moments(self.rows, self.centring.values)))
 
     def split(self, fraction: float, seed: int) -> tuple[TransitionTable, TransitionTable]:
         """Splits at random by episode, so that no episode is on both sides.
@@ -387,15 +379,26 @@ class TransitionTable:
         memory = default_memory() if self._memory is None else self._memory
         return block_batches(self._file, batch_size, generator, epochs, memory)
 
+    def _part(self, start: int, size: int) -> NDArray[np.floating[Any]]:
+        """Some neighbouring columns of the rows, with what they were packed without."""
+        part, centre = self.rows[:, start : start + size], self.centring.centre[start : start + size]
+        return part + centre if centre.any() else part
+
     def _take(self, index: NDArray[np.intp]) -> TransitionTable:
         if self._file is None:
-            return TransitionTable(self.rows[index], self.ny, self.nu, self.episode_ids[index], self.name)
+            return self.take(index)
         parts = (index[i : i + CHUNK] for i in range(0, len(index), CHUNK))
         return self.rewritten((self.rows[part], self.episode_ids[part]) for part in parts)
 
     @classmethod
+    def _built(cls, built: BuiltRows, name: str) -> TransitionTable:
+        return cls(built.rows, built.ny, built.nu, built.episode_ids, name, centring=built.centring)
+
+    @classmethod
     def _of_file(cls, file: TableFile, name: str, memory: int | None) -> TransitionTable:
-        return cls(file.raw_rows, file.ny, file.nu, file.raw_ids, name, file=file, memory=memory)
+        return cls(
+            file.raw_rows, file.ny, file.nu, file.raw_ids, name, centring=file.centring, file=file, memory=memory
+        )
 
     def _row(self, values: NDArray[np.float64]) -> Columns:
-        return Columns(*(column[0] for column in self.columns(values[None, :])))
+        return Columns(*(column[0] for column in split(values[None, :], self.ny, self.nu)))

@@ -116,12 +116,13 @@ class _Episodes:
 
 def _problem_of(mpc: MPC, table: TransitionTable, identification: Identification) -> OneStepProblem:
     """One-step prediction on the whole table, wrapped angles without jumps."""
-    columns = table.columns(table.rows.astype(np.float64))
+    columns = table.values()
     rows = Rows(columns.observations, columns.actions, columns.next_observations)
-    problem = OneStepProblem(mpc, rows)
+    centre = table.centring.centre[: table.ny]
+    problem = OneStepProblem(mpc, rows, centre)
     if not identification.unwrapped:
         return problem
-    return OneStepProblem(mpc, without_jumps(rows, problem.errors(mpc.theta) * problem.scale)[0])
+    return OneStepProblem(mpc, without_jumps(rows, problem.errors(mpc.theta) * problem.scale)[0], centre)
 
 
 def _reidentified(problem: OneStepProblem, error: float) -> Array:

@@ -36,6 +36,7 @@ class LoggedCost:
 
     def __init__(self, table: TransitionTable, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
+        self._level = float(table.centring.centre[table.ny + table.nu])  # a large constant, which ridges would shrink
         train, test = table.split(1.0 - _HELD_OUT, seed) if table.n_episodes > 4 else _rows_split(table, rng)
         (x, cost), (x_test, cost_test) = (_sample(part, rng) for part in (train, test))
         self._features = RandomFeatures(x, 0, rng)
@@ -48,16 +49,16 @@ class LoggedCost:
         self.low = float(min(cost.min(), cost_test.min()))
 
     def _fit(self, x: Array, cost: Array) -> None:
-        self._regression = Ridge.fit(self._features(x), cost[:, None])
+        self._regression = Ridge.fit(self._features(x), cost[:, None] - self._level)
 
     def _r2(self, x: Array, cost: Array) -> float:
-        missed = cost - self._regression(self._features(x))[:, 0]
+        missed = cost - self._level - self._regression(self._features(x))[:, 0]
         variance = float(np.var(cost))
         return 1.0 - float(np.mean(missed**2)) / variance if variance > 0.0 else 1.0
 
     def __call__(self, s: Array, a: Array) -> Array:
         """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``."""
-        cost = self._regression(self._features(np.hstack([s, a])))[:, 0]
+        cost = self._regression(self._features(np.hstack([s, a])))[:, 0] + self._level
         return np.maximum(cost, self.low)
 
 
@@ -66,14 +67,11 @@ def _rows_split(table: TransitionTable, rng: np.random.Generator) -> tuple[Trans
     order = rng.permutation(len(table))
     cut = max(1, int((1.0 - _HELD_OUT) * len(table)))
     train, test = np.sort(order[:cut]), np.sort(order[min(cut, len(table) - 1) :])
-    first, second = (
-        TransitionTable(table.rows[part], table.ny, table.nu, table.episode_ids[part]) for part in (train, test)
-    )
-    return first, second
+    return table.take(train), table.take(test)
 
 
 def _sample(table: TransitionTable, rng: np.random.Generator) -> tuple[Array, Array]:
     """Some rows as (s, a) and cost in float64."""
     rows = np.sort(rng.permutation(len(table))[:_ROWS])
-    columns = table.columns(table.rows[rows].astype(np.float64))
+    columns = table.take(rows).values()
     return np.hstack([columns.observations, columns.actions]), columns.costs

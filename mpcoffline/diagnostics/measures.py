@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.datasets.transitions import Columns, TransitionTable
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman import BellmanFit
+from mpcoffline.learning.bellman import BellmanFit, variance_of
 from mpcoffline.learning.identification import increments_scale
 from mpcoffline.mpc import MPC
 
@@ -99,12 +99,13 @@ def returns_of(value: ValueFunction, table: TransitionTable, discount: float) ->
     observations, returns = [], []
     for k in range(len(ids) - min(max(1, len(ids) // 10), _MOST_EPISODES), len(ids)):
         rows = np.arange(firsts[k], firsts[k] + lengths[k])
-        costs, ended = table.costs[rows].astype(np.float64), table.terminations[rows[-1]] > 0.0
+        episode = table.take(rows)
+        costs, ended = episode.costs.astype(np.float64), episode.terminations[-1] > 0.0
         total = np.zeros(len(rows) + 1)
         for t in range(len(rows) - 1, -1, -1):
             total[t] = costs[t] + discount * total[t + 1]
         complete = len(rows) if ended else max(0, len(rows) - needed)
-        observations.append(table.observations[rows[:complete]])
+        observations.append(episode.observations[:complete])
         returns.append(total[:complete])
     return value.predict(np.concatenate(observations)), np.concatenate(returns)
 
@@ -133,7 +134,7 @@ def fit_errors(
     """
     sample = _sample(table, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
-    unit = float(sample.costs.var(dtype=np.float64)) or 1.0
+    unit = variance_of(sample.costs)
     before, after = (
         _residuals(BellmanFit(mpc, value, unit), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)
@@ -192,7 +193,7 @@ def one_step_error(mpc: MPC, table: TransitionTable) -> float:
     """Root mean square one-step prediction error, every coordinate in the spread of its increments."""
     sample = _sample(table, 3)
     s, reached = (v.astype(np.float64) for v in (sample.observations, sample.next_observations))
-    missed = (mpc.model(s, sample.actions) - reached) / increments_scale(s, reached)
+    missed = (mpc.model(s, sample.actions) - reached) / increments_scale(s, reached, table.centring.centre[: table.ny])
     return float(np.sqrt(np.mean(np.nan_to_num(missed, nan=1e3, posinf=1e3, neginf=-1e3) ** 2)))
 
 
@@ -214,14 +215,13 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
         rows = np.sort(np.random.default_rng(0).permutation(rows)[:_ROWS])
     if len(rows) < 50:
         return LagCheck(0.0, 1.0)
-    s, a = table.columns(table.rows[rows].astype(np.float64))[:2]
-    reached = table.next_observations[rows].astype(np.float64)
-    scale = increments_scale(s, reached)
+    s, a, _, reached, _ = table.take(rows).values()
+    scale = increments_scale(s, reached, table.centring.centre[: table.ny])
     predicted = identified.model(s, a)
     effect = (predicted - identified.model(s, np.broadcast_to(a.mean(axis=0), a.shape))) / scale
     errors = (reached - predicted) / scale
     good = np.isfinite(errors).all(axis=1) & np.isfinite(effect).all(axis=1)
-    past = np.hstack([table.actions[rows - k].astype(np.float64) for k in range(1, _LAGS + 1)])
+    past = np.hstack([table.take(rows - k).actions.astype(np.float64) for k in range(1, _LAGS + 1)])
     present = np.hstack([s, a])
     n_random = min(_LAG_FEATURES, len(rows) // 10)
     features = RandomFeatures(present, n_random, np.random.default_rng(0))(present)[good]
@@ -261,4 +261,4 @@ def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
 def _sample(table: TransitionTable, seed: int, count: int = _ROWS) -> TransitionTable:
     """Some rows, in order."""
     rows = np.sort(np.random.default_rng(seed).permutation(len(table))[:count])
-    return TransitionTable(table.rows[rows], table.ny, table.nu, table.episode_ids[rows], table.name)
+    return table.take(rows)

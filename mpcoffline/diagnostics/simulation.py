@@ -60,7 +60,7 @@ def simulate(
         starts: ``(starts, nx)``.
         n_steps: Length of an episode.
     """
-    columns = table.columns(table.rows.astype(np.float64))
+    columns = table.values()
     middle, spread = columns.observations.mean(axis=0), columns.observations.std(axis=0)
     reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread
     reach = np.where(spread > 0.0, reach, np.inf)
@@ -99,4 +99,4 @@ def initial_states(table: TransitionTable, count: int, seed: int) -> Array:
     chosen = rng.permutation(firsts)[:count]
     if len(chosen) < count:
         chosen = np.concatenate([chosen, rng.integers(len(table), size=count - len(chosen))])
-    return np.asarray(table.observations[np.sort(chosen)], dtype=np.float64)
+    return np.asarray(table.take(np.sort(chosen)).observations, dtype=np.float64)

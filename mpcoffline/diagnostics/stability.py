@@ -55,7 +55,7 @@ def value_growth(value: ValueFunction, table: TransitionTable, states: Array, lo
     """See :class:`TheoremCheck`; states ``(n, nx)`` of rollouts."""
     if lost or not np.isfinite(states).all():
         return np.inf
-    logged = value.predict(table.observations[:: max(1, len(table) // 10_000)])
+    logged = value.predict(table.take(slice(None, None, max(1, len(table) // 10_000))).observations)
     return float((value.predict(states).max() - logged.min()) / max(float(np.ptp(logged)), 1e-12))
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.datasets.transitions import Columns
@@ -11,6 +15,13 @@ from mpcoffline.mpc.torch_twin import TorchTwin
 
 from .identification import FULL_TURN, Rows, without_jumps
 from .value import ValueFunction
+
+
+def variance_of(costs: NDArray[np.floating[Any]]) -> float:
+    """The variance of logged costs ``(n,)``, the unit of the regression error; of one cost only, its square, or 1."""
+    if np.ptp(costs) == 0.0:
+        return float(costs[0]) ** 2 or 1.0
+    return float(costs.var(dtype=np.float64)) or 1.0
 
 
 class BellmanFit:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.checks import check_integers, check_number
 from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.errors import InvalidDataError
 from mpcoffline.mpc import MPC
 
 from .coordinates import Coordinates
@@ -121,14 +122,14 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: Rows) -> None:
+    def __init__(self, mpc: MPC, rows: Rows, centre: Array | float = 0.0) -> None:
         self.coordinates = c = Coordinates(mpc, ("model",))
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
         self.names = [names[i] for i in self.free]
-        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached)
+        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
@@ -181,16 +182,24 @@ class OneStepProblem:
                 residuals(z)
             return slopes[z.tobytes()]
 
-        found = scipy.optimize.least_squares(
-            residuals,
-            np.clip(start, self.low, self.high),
-            jac=derivative,
-            bounds=(self.low, self.high),
-            max_nfev=max_iterations,
-            xtol=1e-10,
-            ftol=1e-12,
-            gtol=1e-12,
-        )
+        try:
+            found = scipy.optimize.least_squares(
+                residuals,
+                np.clip(start, self.low, self.high),
+                jac=derivative,
+                bounds=(self.low, self.high),
+                max_nfev=max_iterations,
+                xtol=1e-10,
+                ftol=1e-12,
+                gtol=1e-12,
+            )
+        except (ValueError, np.linalg.LinAlgError) as error:  # squares of the derivative overflow
+            raise InvalidDataError(
+                "identification",
+                expected="data on which the model's prediction has finite derivatives",
+                actual=f"states up to {np.abs(self.rows.x).max():g} ({error})",
+                hint="Are the data in the model's units?",
+            ) from error
         return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
 
 
@@ -223,10 +232,11 @@ def identify(
     config = config or IdentificationConfig()
     table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
-    problem = OneStepProblem(mpc, _rows(mpc, table, config, rng))
+    centre = table.centring.centre[: table.ny]
+    problem = OneStepProblem(mpc, _rows(mpc, table, config, rng), centre)
     rows, unwrapped = without_jumps(problem.rows, problem.errors(mpc.theta) * problem.scale)
     if unwrapped:
-        problem = OneStepProblem(mpc, rows)
+        problem = OneStepProblem(mpc, rows, centre)
     if not problem.free.size:
         return described(mpc, problem, np.zeros(0), np.zeros((0, 0)), config.prior_spread, unwrapped)
     z, prior = _best_descent(problem, config, rng)
@@ -267,11 +277,17 @@ def described(
     return result
 
 
-def increments_scale(x: Array, reached: Array) -> Array:
-    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1."""
+def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> Array:
+    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1.
+
+    Args:
+        x: States, ``(n, nx)``.
+        reached: Those after them, ``(n, nx)``.
+        centre: What the table that they are from was packed without, ``(nx,)``: it was not rounded to float32.
+    """
     spread = (reached - x).std(axis=0)
-    rounding = 1e-6 * np.abs(x).max(axis=0)
-    return np.where(spread > rounding, spread, np.where(rounding > 0.0, x.std(axis=0) + rounding, 1.0))
+    rounding, least = (1e-6 * np.abs(x - offset).max(axis=0) for offset in (centre, 0.0))
+    return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
 
 
 def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Rows:

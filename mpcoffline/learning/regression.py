@@ -16,7 +16,7 @@ from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import MPC
 
-from .bellman import BellmanFit, PredictionError
+from .bellman import BellmanFit, PredictionError, variance_of
 from .coordinates import Coordinates, canonical
 from .potential import Potential
 from .progress import Metrics, Report, silent
@@ -137,8 +137,11 @@ class ParameterTraining:
         seed: int,
     ) -> None:
         self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
+        costs = table.costs
+        if len(costs) > 1 and np.ptp(costs) == 0.0:
+            _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
         self._rng = np.random.default_rng(seed)
-        self._problem = BellmanFit(mpc, value, float(table.costs.var(dtype=np.float64)) or 1.0)
+        self._problem = BellmanFit(mpc, value, variance_of(costs))
         rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
         self._sample = table.columns(torch.from_numpy(table.rows[rows]))
         self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))

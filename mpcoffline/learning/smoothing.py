@@ -106,12 +106,12 @@ def with_measurement_noise(table: TransitionTable, level: float, seed: int) -> T
         InvalidArgumentError: For a negative level.
     """
     check_number("level", level, 0.0, open_low=False)
-    rng, columns = np.random.default_rng(seed), table.columns(table.rows.astype(np.float64))
+    rng, columns = np.random.default_rng(seed), table.values()
     size = level * columns.observations.std(axis=0)
     s, reached = (
         part + size * rng.standard_normal(part.shape) for part in (columns.observations, columns.next_observations)
     )
-    return _with_states(table, s, reached)
+    return table.with_states(s, reached)
 
 
 def estimate_noise(mpc: MPC, table: TransitionTable, theta: Array | None = None) -> NoiseEstimate:
@@ -161,9 +161,9 @@ def smooth(
     """
     if noise.measurement.shape != (mpc.nx,):
         raise InvalidArgumentError("noise", expected=f"{mpc.nx} coordinates", actual=str(noise.measurement.shape))
-    parts = (_rows_of(table, slice(start, start + _CHUNK)) for start in range(0, len(table), _CHUNK))
+    parts = (table.take(slice(start, start + _CHUNK)) for start in range(0, len(table), _CHUNK))
     smooth_parts = (
-        _with_states(part, *_smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)) for part in parts
+        part.with_states(*_smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)) for part in parts
     )
     return table.rewritten((part.rows, part.episode_ids) for part in smooth_parts)
 
@@ -195,7 +195,8 @@ def identify_smoothed(
     noise = _noise(few, first.theta)
     if noise.source == "unknown" or noise.negligible:
         return SmoothedIdentification(first, table, noise)
-    coordinates = OneStepProblem(mpc, few.rows())
+    centre = table.centring.centre[: table.ny]
+    coordinates = OneStepProblem(mpc, few.rows(), centre)
     z, information = coordinates.z(first.theta), np.zeros((0, 0))
     about = few.measured
     for _ in range(_ROUNDS):
@@ -212,7 +213,7 @@ def identify_smoothed(
     result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
     clean = Trajectories.of(mpc, _excerpt(result, seed), first.unwrapped)
     identification = described(
-        mpc, OneStepProblem(mpc, clean.rows()), z, information, config.prior_spread, first.unwrapped
+        mpc, OneStepProblem(mpc, clean.rows(), centre), z, information, config.prior_spread, first.unwrapped
     )
     return SmoothedIdentification(identification, result, noise)
 
@@ -319,16 +320,4 @@ def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
         return table
     chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])
     rows = (chosen[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
-    return _rows_of(table, rows[rows < len(table)])
-
-
-def _rows_of(table: TransitionTable, rows: slice | NDArray[np.intp]) -> TransitionTable:
-    return TransitionTable(table.rows[rows], table.ny, table.nu, table.episode_ids[rows], table.name)
-
-
-def _with_states(table: TransitionTable, s: Array, reached: Array) -> TransitionTable:
-    """The table with other states."""
-    rows = np.array(table.rows)
-    columns = table.columns(rows)
-    columns.observations[:], columns.next_observations[:] = s, reached
-    return TransitionTable(rows, table.ny, table.nu, table.episode_ids, table.name)
+    return table.take(rows[rows < len(table)])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,8 @@ TerminalKind = Literal["quadratic", "network"]
 
 TERMINAL_KINDS = ("quadratic", "network")
 
-_FLAT = 1e-6  # relative spread below which a coordinate counts as constant
+_FLAT = 1e-6  # relative spread below which a coordinate counts as constant, in float32
+_FLAT_DOUBLE = 1e-12  # the same where states have the digits of float64
 _MAX_ERROR = 0.5  # of the spread of V: what is worse than this has learned nothing
 
 
@@ -101,8 +102,8 @@ def fit_terminal(
 
     Args:
         kind: ``"quadratic"`` or ``"network"``.
-        value: V, from float32 states ``(n, nx)`` to ``(n,)``; e.g. a
-            :class:`~mpcoffline.learning.ValueFunction`.
+        value: V, from states ``(n, nx)`` to ``(n,)``; e.g. a :class:`~mpcoffline.learning.ValueFunction`. The states
+            are float32, or float64 where the given ones have more digits.
         observations: States of the data, ``(n, nx)``.
         x_ref: Where q has its minimum, ``(nx,)``.
         seed: Seeds weights and minibatches; the same seed gives the same weights on the same machine.
@@ -110,7 +111,8 @@ def fit_terminal(
         config: Size of the network and schedule.
 
     Returns:
-        A :class:`~mpcoffline.QuadraticCost` or a :class:`~mpcoffline.NetworkCost`; :func:`terminal_error` says how
+        A :class:`~mpcoffline.QuadraticCost` or a :class:`~mpcoffline.NetworkCost` (the former also where V does not
+        vary); :func:`terminal_error` says how
         close it is.
 
     Raises:
@@ -128,13 +130,13 @@ def fit_terminal(
     states = states[np.sort(rng.permutation(len(states))[: config.max_rows])]
     targets = _values(value, states)
     W, constant = _fit_quadratic(states, reference, targets)
-    if kind == "quadratic":
+    if kind == "quadratic" or targets.std() <= _FLAT * np.abs(targets).max():  # a constant has nothing for a network
         return QuadraticCost(W, x_ref=reference, constant=constant)
 
     e = states - reference
     rest = targets - np.einsum("bi,ij,bj->b", e, W, e) - constant
     mean, std = states.mean(axis=0), states.std(axis=0)
-    std = np.where(std > _FLAT * (1.0 + np.abs(mean)), std, 1.0)
+    std = np.where(std > _flat(states) * (1.0 + np.abs(mean)), std, 1.0)
     offset, scale = float(rest.mean()), float(rest.std()) or 1.0
     weights, biases = fit_network(
         (states - mean) / std,
@@ -182,10 +184,21 @@ def _states(observations: ArrayLike, nx: int | None = None) -> Array:
     return states
 
 
+def _narrowed(states: Array) -> NDArray[np.floating[Any]]:
+    """The states in float32, where that holds them."""
+    narrow = states.astype(np.float32)
+    return narrow if np.array_equal(narrow, states) else states
+
+
+def _flat(states: Array) -> float:
+    """The relative spread below which a coordinate of these states counts as constant."""
+    return _FLAT if _narrowed(states).dtype == np.float32 else _FLAT_DOUBLE
+
+
 def _values(value: Value, states: Array) -> Array:
     """V of states ``(n, nx)`` in float64, ``(n,)``."""
     with torch.no_grad():
-        values = value(torch.from_numpy(states.astype(np.float32))).double().numpy()
+        values = value(torch.from_numpy(_narrowed(states))).double().numpy()
     if values.shape != states.shape[:1] or not np.isfinite(values).all():
         raise InvalidDataError(
             "value", expected=f"{len(states)} finite numbers", actual=f"shape {values.shape}, or NaN or inf in it"
@@ -202,7 +215,9 @@ def _fit_quadratic(states: Array, x_ref: Array, targets: Array) -> tuple[Array, 
     n, nx = states.shape
     e = states - x_ref
     size = np.sqrt(np.mean(e**2, axis=0))
-    size = np.where(size > _FLAT * np.abs(states).max(axis=0), size, np.inf)  # what stays at x_ref gets no weight
+    size = np.where(
+        size > _flat(states) * np.abs(states).max(axis=0), size, np.inf
+    )  # what stays at x_ref gets no weight
     spread = float(targets.std()) or 1.0
     products = np.einsum("bi,bj->bij", e / size, e / size).reshape(n, -1)
     mean_products, mean_target = products.mean(axis=0), targets.mean()

@@ -54,7 +54,7 @@ class Trajectories:
     def of(cls, mpc: MPC, table: TransitionTable, unwrapped: tuple[int, ...]) -> Trajectories:
         """Cuts the table into trajectories."""
         table.check_fits(mpc.nx, mpc.nu)
-        columns = table.columns(table.rows.astype(np.float64))
+        columns = table.values()
         s, reached, spread = columns.observations, columns.next_observations, columns.observations.std(axis=0)
         difference = _wrapped(reached[:-1] - s[1:], unwrapped)
         within = (table.episode_ids[1:] == table.episode_ids[:-1]) & (columns.terminations[:-1] == 0.0)

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from mpcoffline.datasets.table_math import split
 from mpcoffline.datasets.transitions import TransitionTable
 from mpcoffline.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 
@@ -66,7 +67,8 @@ class ValueFunction(nn.Module):
         Where episodes terminate, gamma is multiplied by the share of transitions that go on.
         """
         mean, std, low, high = table.statistics()
-        largest = np.maximum(np.abs(low.observations), np.abs(high.observations))
+        centre = split(table.centring.centre[None], table.ny, table.nu)  # of which float32 does not have to hold digits
+        largest = np.maximum(*(np.abs(end.observations - centre.observations[0]) for end in (low, high)))
         self.gamma.fill_(discount)
         self.mean.copy_(torch.from_numpy(mean.observations))
         self.std.copy_(torch.from_numpy(np.where(std.observations > _ROUNDING * largest, std.observations, 1.0)))
@@ -76,8 +78,9 @@ class ValueFunction(nn.Module):
         # An end is worth as much as a cost of -gamma * offset.
         spread = float(np.hypot(std.costs, discount * offset * std.terminations))
         size = max(abs(float(low.costs)), abs(float(high.costs)))
+        rounding = _ROUNDING * max(abs(float(end.costs - centre.costs[0])) for end in (low, high))
         self.offset.fill_(offset)
-        self.scale.fill_(horizon * (spread if spread > _ROUNDING * size else size or 1.0))
+        self.scale.fill_(horizon * (spread if spread > rounding else size or 1.0))
 
     def forward(self, observations: Tensor) -> Tensor:
         """V_phi of observations ``(..., ny)``, shape ``(...)`` in float64."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from mpcoffline.datasets.table_math import split
 from mpcoffline.datasets.transitions import Columns, TableStatistics, TransitionTable
 
 from .value_function import ValueFunction
@@ -40,14 +42,20 @@ class Units:
         spread = [value.std, action_std, scale, value.std, one]
         self._shift, self._spread = torch.cat(shift).to(device), torch.cat(spread).to(device)
         self._end = float(discount * offset / scale)
-        self._table = table
+        self._ny, self._nu, self._increments = table.ny, table.nu, None
+        if not table.centring.is_none:
+            self._increments = torch.from_numpy(table.centring.increments.astype(np.float64)).to(device)
+            self._shift[-1 - table.ny : -1] *= 1.0 - self._increments  # the difference of two states has none
+            self._shift -= torch.from_numpy(table.centring.centre).to(device)
         low, high = value_bounds(statistics, discount)
         self.bounds = float((low - offset) / scale), float((high - offset) / scale)
 
     def columns(self, rows: Tensor) -> Columns:
         """The columns of packed rows ``(B, 2 ny + nu + 2)`` of the table, float32."""
-        batch = self._table.columns((rows - self._shift) / self._spread)
+        batch = split((rows - self._shift) / self._spread, self._ny, self._nu)
         costs = batch.costs - self._end * batch.terminations
+        if self._increments is not None:
+            batch.next_observations.add_(self._increments * batch.observations)
         return Columns(*(column.float() for column in batch._replace(costs=costs)))
 
 
