@@ -55,7 +55,7 @@ class MPCPolicy(BasePolicy):
             actions scaled to [-1, 1] is 0.05 here.
         seed: Seeds the noise; :meth:`set_random_seed` starts it anew.
         rescue: ``"ipopt"`` has ipopt try what the solver failed to solve, hundreds of times slower; its program is
-            built at the first failure. None, the default, for no rescue.
+            built at the first failure. None, the default, for no rescue. Exported C has none.
         rescue_time: Time that ipopt may take for a problem, in s, the building aside.
         **solver_options: Passed to the solver.
 

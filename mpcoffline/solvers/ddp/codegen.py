@@ -52,7 +52,7 @@ _FORMATS = {
 # GCC's effort grows with the square of a function's length. Only functions of costs that are networks are so long.
 _LONGEST = 2500
 _PIECE = 500
-_LARGEST_BENT = 5000  # nodes of a model whose second derivatives are taken; those of networks would take minutes
+_LARGEST_BENT = 2000  # nodes of a model whose second derivatives are taken: they double the code
 # Inlined, the time of a cart-pole's expansion depends on where the linker puts it, by a quarter.
 _ATTRIBUTES = {"gen_q": "NOINLINE "}
 

@@ -66,7 +66,8 @@ class DDPSolver(Solver):
     Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
     and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. Costs whose
     class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian; stage costs that
-    are linear in the states (prices) with the curvature of the model besides, as they have none of their own.
+    are linear in the states (prices) with the curvature of the model besides, as they have none of their own, unless
+    the model is large (a network).
 
     A cold problem is solved from 16 of 64 fixed input sequences, each the cheapest of four that are alike; the best
     four of different costs go on after three iterations, and the best solution is kept. A warm one is solved from its
