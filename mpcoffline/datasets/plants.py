@@ -128,7 +128,7 @@ def common_spec(name: str, specs: Sequence[EnvSpec | None]) -> EnvSpec | None:
                 f"{name}'s environments",
                 expected=f"copies of one, as a data set stores the arguments of one: {_described(plain[0])}",
                 actual=f"{_described(spec)} as number {i}",
-                hint="Record each into a data set of its own; minari.combine_datasets and fit take several.",
+                hint="Record each into a data set of its own; TransitionTable.concat makes one table of them.",
             )
     return plain[0]
 
