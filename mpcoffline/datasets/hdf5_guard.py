@@ -219,6 +219,8 @@ class _Walk:
         if not {_SPACE, _TYPE, _LAYOUT} <= messages.keys() or content[messages[_LAYOUT]] != 3:
             return self._other_array(where)
         space, kind, layout = (messages[key] for key in (_SPACE, _TYPE, _LAYOUT))
+        if content[space] == 2 and content[space + 3] == 2:  # a null array
+            return (0, 0)
         rank, begin = content[space + 1], space + (8 if content[space] == 1 else 4)
         shape = struct.unpack_from(f"<{rank}Q", content, begin)
         (itemsize,) = struct.unpack_from("<I", content, kind + 4)
@@ -273,13 +275,14 @@ class _Walk:
             return
         if array.ndim != 1:
             raise self._refused(where, "one text a row", f"shape {array.shape}")
-        first = 0
+        first, left = 0, self._bytes_left
         while first < len(array):
-            count = min(4096, max(1, self._bytes_left // (4 * len(self._content))))
-            self._bytes_left -= sum(len(text) for text in array[first : first + count])
+            count = min(4096, max(1, left // (4 * len(self._content))))
+            left -= sum(len(text) for text in array[first : first + count])
             first += count
-            if self._bytes_left < 0:
+            if left < 0:
                 raise self._refused(where, "texts of the size of their file", "more")
+        self._bytes_left = left
 
     def _other_array(self, where: str) -> tuple[int, ...]:
         """The same for an array in another of HDF5's forms."""

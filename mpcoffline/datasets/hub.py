@@ -297,7 +297,10 @@ def _check(staged: Path, dataset_id: str, source: Source, *, unchecked: bool) ->
 def _download_folder(dataset_id: str) -> Iterator[Path]:
     """A folder of this process alone, hidden from Minari, that is still there at the next attempt."""
     root = dataset_path("") / ".downloading"
-    folder = root / dataset_id.replace("/", "--")
+    label = dataset_id.replace("/", "--")
+    if len(os.fsencode(label)) > 200:  # names of files end at 255 bytes
+        label = hashlib.sha256(os.fsencode(dataset_id)).hexdigest()
+    folder = root / label
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(root / f"{folder.name}.lock", os.O_RDWR | os.O_CREAT, 0o644)

@@ -19,6 +19,7 @@ from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError
 
 MANIFEST = "SHA256SUMS"
+_NOT_LISTED = "no file that is not listed"
 _LINE = re.compile(r"([0-9a-f]{64})  ([^\\\x00-\x1f]+)")
 
 
@@ -35,6 +36,11 @@ class Difference:
     path: str
     expected: str
     actual: str
+
+    @property
+    def concerns_data(self) -> bool:
+        """False for a file that nobody listed beside the data, such as notes, or another data set within."""
+        return self.expected != _NOT_LISTED or self.path.startswith("data/")
 
     def __str__(self) -> str:
         return visible(f"{self.path}: expected {self.expected}, got {self.actual}")
@@ -141,7 +147,7 @@ def differences(folder: Path) -> list[Difference]:
         actual = f"sha256 {sha256_of(folder / path)}" if path in found else "no such file"
         if actual != f"sha256 {digest}":
             result.append(Difference(path, f"sha256 {digest}", actual))
-    result += [Difference(path, "no file that is not listed", "one") for path in sorted(found - set(sums))]
+    result += [Difference(path, _NOT_LISTED, "one") for path in sorted(found - set(sums))]
     return result
 
 

@@ -125,13 +125,16 @@ def check_sums(folder: Path) -> None:
     Raises:
         FileFormatError: Telling damage from a change by another program, where the dates do.
     """
+    name = _id_of(folder)
     try:
-        wrong = differences(folder)
+        wrong = [difference for difference in differences(folder) if difference.concerns_data]
     except FileNotFoundError:
         return
+    except FileFormatError as error:
+        hint = f"If the data are good, `mpcoffline datasets verify {name} --accept` writes {MANIFEST} anew."
+        raise FileFormatError(error.name, expected=error.expected, actual=error.actual, hint=hint) from error
     if not wrong:
         return
-    name = _id_of(folder)
     hint = f"Restore it from a copy, or download it again. `mpcoffline datasets verify {name}` says what is wrong."
     if was_changed(folder, [difference.path for difference in wrong]):
         hint = (

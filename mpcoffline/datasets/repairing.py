@@ -330,7 +330,9 @@ def _is_readable(dataset_id: str) -> bool:
 def _back_up(dataset_id: str) -> Path:
     """Keeps the folder as it is under another, hidden name: links where they can be, so that it needs no room yet."""
     source, number = dataset_path(dataset_id), 0
-    while (backup := dataset_path("") / ".broken" / f"{dataset_id}-{number}").exists():
+    start = dataset_path("") / ".broken" / dataset_id
+    start = start.with_name(os.fsdecode(os.fsencode(start.name)[:240]))  # names of files end at 255 bytes
+    while (backup := start.with_name(f"{start.name}-{number}")).exists():
         number += 1
     backup.parent.mkdir(parents=True, exist_ok=True)
     shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)

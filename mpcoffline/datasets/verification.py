@@ -217,7 +217,7 @@ def _episodes(dataset: MinariDataset, faulty: Set[int]) -> Iterator[tuple[int, A
 
 def _hash_findings(folder: Path) -> tuple[bool, list[Finding]]:
     try:
-        return True, [Finding("hash", str(difference)) for difference in differences(folder)]
+        return True, [Finding("hash", str(d), serious=d.concerns_data) for d in differences(folder)]
     except FileNotFoundError:
         return False, []
     except (FileFormatError, OSError) as error:
