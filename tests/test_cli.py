@@ -49,7 +49,7 @@ def refused(*arguments: str | Path) -> str:
     return lines[0]
 
 
-COMMANDS = ["run", "reproduce", "collect", "learn", "evaluate", "diagnose", "plot", "export", "doctor"]
+COMMANDS = ["run", "reproduce", "collect", "learn", "evaluate", "diagnose", "plot", "export", "clean", "doctor"]
 DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
 
 

@@ -72,8 +72,9 @@ def compiled(source: str) -> ctypes.CDLL:
     for compiler in compilers():
         try:
             library = _compiled_by(compiler, source)
-        except CompilerError:
-            reason = trial(compiler)
+        except CompilerError as error:
+            full = error.actual in {os.strerror(code) for code in _NO_ROOM}  # for the next one, too
+            reason = "" if full else trial(compiler)
             if not reason:
                 raise
             refusals.append(f"{compiler} cannot compile vectors of doubles ({reason.splitlines()[0]})")
@@ -160,7 +161,8 @@ def _compiled_by(compiler: str, source: str) -> ctypes.CDLL:
                 warn_once(f"The cache folder {folder} cannot be used ({failure}).")
     except StorageError as error:
         failure = str(error)
-    raise _failure(compiler, failure)
+    hint = "Free some space, or set MPCOFFLINE_CACHE to a folder of yours where there is room for it."
+    raise _failure(compiler, failure, hint)
 
 
 @functools.cache
@@ -286,10 +288,10 @@ def _too_large(compiler: str, message: str) -> CompilerError:
     )
 
 
-def _failure(compiler: str, message: str) -> CompilerError:
+def _failure(compiler: str, message: str, hint: str = "Set CC to another one.") -> CompilerError:
     return CompilerError(
         f"C compiler {compiler}",
         expected="a compiled solver",
         actual=message.strip()[:500] or "no message",
-        hint="Set CC to another one.",
+        hint=hint,
     )
