@@ -195,9 +195,11 @@ class Round:
 
 def can_clean() -> bool:
     """Whether there is a command that cleans up."""
+    from typer.main import get_group
+
     from mpcoffline.cli import app
 
-    return any((command.name or command.callback.__name__) == "clean" for command in app.registered_commands)
+    return "clean" in get_group(app).commands
 
 
 def clean() -> None:
