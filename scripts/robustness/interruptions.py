@@ -99,7 +99,7 @@ def replacing(case: Round) -> None:
 
 def extending(case: Round) -> None:
     """The second training with a recorder is killed; both are in the data set."""
-    case.killed(lambda: with_agent(1, 2, 80, rounds=3), b"b", within=1.0)
+    case.killed(lambda: with_agent(1, 2, 80, rounds=3), b"s", within=0.6)
     promised = set(PROMISES)
     case.repaired()
     case.check(promised)
