@@ -71,7 +71,7 @@ def resuming(case: Round) -> None:
 
 def repairing(case: Round) -> None:
     """A repair is killed twice."""
-    case.killed(lambda: with_agent(1, 2, 10**6), b"b", within=0.4)
+    case.killed(lambda: with_agent(1, 2, 10**6), b"b", within=0.8)
     promised = set(PROMISES)
     from mpcoffline.datasets import repair
 
@@ -99,7 +99,7 @@ def replacing(case: Round) -> None:
 
 def extending(case: Round) -> None:
     """The second training with a recorder is killed; both are in the data set."""
-    case.killed(lambda: with_agent(1, 2, 80, rounds=3), b"b", within=1.0)
+    case.killed(lambda: with_agent(1, 2, 80, rounds=3), b"s", within=0.6)
     promised = set(PROMISES)
     case.repaired()
     case.check(promised)
@@ -210,11 +210,13 @@ def _without_room(case: Round, way: str, before: Job | None, room: Job) -> None:
 # --- signals ------------------------------------------------------------------------------------------------------
 
 
-def _interrupted(case: Round, words: list[str], within: float, times: int) -> Ended:
-    """A command that is interrupted some times and then runs to its end."""
-    for _ in range(times):
+def _interrupted(case: Round, words: list[str], until: Path, within: float) -> Ended:
+    """A command that is interrupted twice, some time after a file exists below a folder, and then runs to its end."""
+    for _ in range(2):
         number = case.rng.choice((signal.SIGINT, signal.SIGTERM))
-        ended = case.killed(lambda: command(*words), within=within, number=number)
+        ended = case.killed(
+            lambda: command(*words), lambda: any(until.rglob("*.log")) or until.is_file(), within, number
+        )
         if "Traceback (most recent call last)" in ended.text:
             case.problem(f"raw error: {ended.text.strip().splitlines()[-1][:200]}")
     return case.run(lambda: command(*words))
@@ -239,9 +241,9 @@ def collected(case: Round) -> None:
     """``mpcoffline collect`` is interrupted twice, and run again to its end: as many steps as asked for, none twice."""
     import h5py
 
-    steps = 120
-    words = ["collect", "pendulum", "--steps", str(steps), "--seed", "1", "--dataset-id", ID]
-    ended = _interrupted(case, words, 4.0, 2)
+    steps = 250
+    words = ["collect", "linear", "--steps", str(steps), "--seed", "1", "--dataset-id", ID]
+    ended = _interrupted(case, words, store() / ".recording", 2.0)
     path = store() / ID / "data" / "main_data.hdf5"
     if not path.exists():
         case.problem(f"lost: no data set; {ended.text.strip()[-200:]}")
@@ -288,7 +290,7 @@ def fitted(case: Round) -> None:
 def learned(case: Round) -> None:
     """``mpcoffline learn --checkpoint`` is interrupted, and run again to its end: the same theta."""
     words = ["learn", "linear", "--preset", "fast", "--steps", "300", "--seed", "2", "--out", "learned.zip"]
-    _interrupted(case, [*words, "--checkpoint", "fit.ckpt"], 15.0, 2)
+    _interrupted(case, [*words, "--checkpoint", "fit.ckpt"], case.folder / "fit.ckpt", 5.0)
     _compare(case, "learn", lambda: command(*words))
 
 

@@ -127,21 +127,27 @@ class Round:
         """Does a job to its end in a process of its own."""
         return self.wait(self.start(job, before))
 
-    def killed(self, job: Job, until: bytes = b"", within: float = 0.3, number: int = signal.SIGKILL) -> Ended:
+    def killed(
+        self,
+        job: Job,
+        until: bytes | Callable[[], bool] = b"",
+        within: float = 0.3,
+        number: int = signal.SIGKILL,
+    ) -> Ended:
         """Does a job and kills it, some time after it has said something, or at one of its calls of a C function.
 
         Args:
             job: The job.
-            until: The letter from which on the time runs.
+            until: What begins the time: a letter that is said, or something that is true.
             within: The time is drawn from 0 to so many seconds.
             number: The signal.
         """
-        if number == signal.SIGKILL and self.rng.random() < 0.4:
+        if number == signal.SIGKILL and isinstance(until, bytes) and self.rng.random() < 0.4:
             last = int(10 ** self.rng.uniform(*((2.5, 5.3) if until == b"b" else (1.0, 4.8))))
             return self.run(job, lambda: _kill_at_call(last, until))
         child, delay = self.start(job), self.rng.uniform(0, within)
         gone = 0
-        while until and PROMISES.said != until and not gone:
+        while until and not gone and not (until() if callable(until) else PROMISES.said == until):
             gone = os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
             time.sleep(0.0005)
         end = time.monotonic() + delay
@@ -189,9 +195,11 @@ class Round:
 
 def can_clean() -> bool:
     """Whether there is a command that cleans up."""
+    from typer.main import get_group
+
     from mpcoffline.cli import app
 
-    return any((command.name or command.callback.__name__) == "clean" for command in app.registered_commands)
+    return "clean" in get_group(app).commands
 
 
 def clean() -> None:
