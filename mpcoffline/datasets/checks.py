@@ -134,9 +134,9 @@ def check_storable(name: str, space: spaces.Space[Any]) -> None:
 
 
 def check_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
-    """A copy as an array, or ``InvalidDataError`` for objects, texts, records or a ragged list."""
+    """The values as an array, or ``InvalidDataError`` for objects, texts, records or a ragged list."""
     try:
-        array = np.array(values)
+        array = np.asarray(values)
     except ValueError as error:
         raise InvalidDataError(name, expected="an array of numbers", actual=str(error)) from error
     if array.dtype.kind not in NUMBERS:

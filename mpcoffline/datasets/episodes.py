@@ -35,7 +35,7 @@ class EpisodeBuilder:
 
     def __init__(self, observation: ArrayLike, info: Mapping[str, Any], rule: PlantInfo) -> None:
         self._rule = rule
-        self._observations = [check_numbers("first observation", observation)]
+        self._observations = [np.array(check_numbers("first observation", observation))]
         self._actions: list[NDArray[Any]] = []
         self._rewards: list[float] = []
         self._terminations: list[bool] = []
