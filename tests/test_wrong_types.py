@@ -52,5 +52,6 @@ def test_the_nearest_name_is_proposed_for_texts_alone() -> None:
 @pytest.mark.parametrize("kind", [int, np.int32, np.uint64])
 def test_seeds_become_integers_of_python(kind: Any) -> None:
     assert type(checked_seed("seed", kind(7))) is int
+    assert type(setup_of("pendulum", 1.0, kind(7)).seed) is int
     with pytest.raises(InvalidArgumentError, match="seed: expected an integer >= 0"):
         checked_seed("seed", -1)

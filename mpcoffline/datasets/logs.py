@@ -101,7 +101,8 @@ def record(
     actor = in_units(policy)
     cap, rule = step_cap(made, max_episode_steps), PlantInfo("record", cost_key)
     # Wrappers that change no space add nothing to what is recorded, and not all can be rebuilt.
-    wrappers = made.observation_space != plant_of(made).observation_space
+    plant = plant_of(made)
+    wrappers = (made.observation_space, made.action_space) != (plant.observation_space, plant.action_space)
     recording = Recording(
         dataset_id,
         env_spec=plain_spec(made.spec, wrappers=wrappers),

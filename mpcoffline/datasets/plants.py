@@ -156,8 +156,8 @@ def check_spaces(policy: Any, env: Any) -> None:
                 f"env.{name}",
                 expected=f"the policy's {own}",
                 actual=str(given),
-                hint="Is it the environment that the policy was made for, without wrappers that rescale? (Where only"
-                f" bounds differ, MPCPolicy(mpc, {name}=env.{name}) says that they are meant.)",
+                hint="Is the policy used in the environment that its MPC models or it learned in, without wrappers that"
+                f" rescale? (Where only bounds differ, MPCPolicy(mpc, {name}=env.{name}) says that they are meant.)",
             )
 
 

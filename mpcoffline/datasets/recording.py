@@ -303,10 +303,11 @@ def _spec_json(spec: EnvSpec | None) -> str | None:
         return None
     try:
         return spec.to_json()
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise InvalidArgumentError(
             f"environment {spec.id!r}",
             expected="a spec that can be stored as JSON",
             actual=str(error),
-            hint='Register it with entry_point="module:Class" instead of the class itself.',
+            hint='Register it with entry_point="module:Class" instead of the class itself, and give it numbers, texts'
+            " and lists as arguments.",
         ) from error

@@ -78,6 +78,7 @@ def run_task(
     """
     check_integers(1, n_episodes=n_episodes)
     setup = setup_of(task, alpha, seed)
+    seed = setup.seed
     data = load_dataset(dataset or setup.dataset_id)
     options: dict[str, Any] = {"preset": "paper", "seed": seed, "value": value} | learner_options
     OfflineMPCLearner(setup.nominal, **options)  # refuses wrong options before a folder is made

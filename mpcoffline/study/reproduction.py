@@ -60,7 +60,7 @@ def _done(folder: Path, task: str, alpha: float, seed: int, n_episodes: int) -> 
     except (FileFormatError, FileNotFoundError):
         return None
     setup = setup_of(task, alpha, seed)
-    wanted = (task, float(alpha), seed, setup.dataset_id, "residual", setup.starts(n_episodes))
+    wanted = (task, float(alpha), setup.seed, setup.dataset_id, "residual", setup.starts(n_episodes))
     found = (result.task, result.alpha, result.seed, result.dataset_id, result.value, result.starts)
     return result if found == wanted and (folder / "figure.png").exists() else None
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
+from mpcoffline.checks import checked_seed
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.envs import ControlTask
 from mpcoffline.envs.linear_tracking import ACTION_WEIGHT, MAX_ALPHA, STATE_WEIGHT, plant_matrices
@@ -67,9 +68,9 @@ def setup_of(task: str, alpha: float, seed: int) -> Setup:
 
     Raises:
         UnknownIdError: For another task.
-        InvalidArgumentError: For an alpha out of the task's range.
+        InvalidArgumentError: For an alpha out of the task's range, or a negative seed.
     """
-    recipe = Recipe.load(task)
+    recipe, seed = Recipe.load(task), checked_seed("seed", seed)
     if recipe.alpha is None:
         return Setup(
             task,

@@ -268,6 +268,13 @@ def test_repeated_actions_cost_their_sum() -> None:
     assert evaluate(Zero(0.5), Twice(plant), 1).cost[0] == pytest.approx(-sum(plant.paid))
 
 
+def test_arguments_that_cannot_be_stored_are_refused_before_the_first_step(drift: str) -> None:
+    env = gym.make(drift, info=costly)
+    with pytest.raises(InvalidArgumentError, match=r"environment 'test/Drift-v0': .*stored as JSON"):
+        record(env, Zero(), 1, "test/callable-v0")
+    assert env.unwrapped.paid == []  # type: ignore[attr-defined]
+
+
 # ---------------------------------------------------------------- for how long
 
 
