@@ -52,13 +52,13 @@ def test_a_console_prints_no_escape_but_its_own() -> None:
     table = Table("x")
     table.add_row(HOSTILE)
     stream = io.StringIO()
-    console = SafeConsole(file=stream, force_terminal=True, width=200)
+    console = SafeConsole(file=stream, force_terminal=True, width=200, highlight=False)
     for shown in (HOSTILE, Text(HOSTILE, style="bold"), table):
         console.print(shown)
     assert "\x1b]" not in stream.getvalue()
     assert "\x1b[2J" not in stream.getvalue()
     assert "\u202e" not in stream.getvalue()
-    assert stream.getvalue().count(r"\x1b]0;title\x07") == 3
+    assert stream.getvalue().count(r"\x1b]0;title") == 3
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])

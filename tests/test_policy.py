@@ -195,7 +195,7 @@ def test_the_same_seed_gives_the_same_noise() -> None:
 
 @pytest.mark.parametrize("noise", [-0.1, np.nan, np.inf])
 def test_noise_out_of_range_is_refused(noise: float) -> None:
-    with pytest.raises(InvalidArgumentError, match="exploration_noise: expected a finite number >= 0"):
+    with pytest.raises(InvalidArgumentError, match="exploration_noise: expected a finite number from 0"):
         MPCPolicy(lq_plant.make_mpc(), exploration_noise=noise)
 
 

@@ -204,7 +204,7 @@ class Block:
         try:
             block = cls(name, shape, theta, low, high, data["kind"], data["group"], data["unit"])
         except InvalidArgumentError as error:
-            raise FileFormatError(error.name, expected=error.expected, actual=error.actual) from error
+            raise FileFormatError(f"parameter {name}", expected=error.expected, actual=error.actual) from error
         n = shape[0] if shape else 1
         size = n * (n + 1) // 2 if block.kind == "psd" else int(np.prod(shape))
         square = block.kind == "free" or (block.kind == "psd" and shape == (n, n))

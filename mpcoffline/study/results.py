@@ -213,7 +213,9 @@ class TaskResult:
             "results.md": self.markdown(),
             "results.csv": sheet.getvalue(),
         }
-        return [write_file(folder / name, contents[name]) for name in (*list(contents)[1:], RESULTS)]
+        for name in reversed(contents):
+            write_file(folder / name, contents[name])
+        return [folder / name for name in contents]
 
     @classmethod
     def load(cls, path: Path) -> TaskResult:

@@ -135,3 +135,14 @@ def test_a_damaged_or_foreign_file_is_refused_by_name(result: TaskResult, tmp_pa
     path.write_text(damage(path.read_text()))  # type: ignore[operator]
     with pytest.raises(FileFormatError, match=r"results\.json"):
         TaskResult.load(path)
+
+
+def test_what_says_that_a_run_is_complete_is_written_last(
+    result: TaskResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An interruption leaves no results.json beside the tables and figures of another run."""
+    written: list[str] = []
+    monkeypatch.setattr("mpcoffline.study.results.write_file", lambda path, content: written.append(path.name))
+    result.save(tmp_path)
+    assert written[-1] == "results.json"
+    assert sorted(written) == ["results.csv", "results.json", "results.md"]
