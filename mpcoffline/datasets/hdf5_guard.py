@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ _ONE_LEAF = (b"TREE\0\0\1\0", b"TREE\1\0\1\0")  # a tree of one entry, of a grou
 
 _CONTINUATIONS = 256
 
+_EPISODE = re.compile(r"episode_(0|[1-9][0-9]{0,17})")
 _FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, OverflowError, struct.error)
 
 _Messages = dict[int, int]
@@ -66,6 +68,12 @@ def check_episodes(path: Path) -> dict[str, str]:
         FileFormatError: Where the root itself cannot be read.
     """
     return {name: "" if fault is None else str(fault).rstrip(".") for name, (_, fault) in _looked_over(path).items()}
+
+
+def episode_number(group: str) -> int | None:
+    """The number of an episode's group; None for a group of another name."""
+    match = _EPISODE.fullmatch(group)
+    return None if match is None else int(match[1])
 
 
 def _looked_over(path: Path) -> dict[str, tuple[int, FileFormatError | None]]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.errors import FileFormatError
 
+from .hdf5_guard import episode_number
 from .manifest import MANIFEST, differences, write_manifest
 from .minari_store import check_dataset_id, dataset_path, is_local, load_dataset
 from .opening import DATA_FILE, faults_of, open_to_examine
@@ -158,8 +159,8 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
 
 
 def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[str, str]) -> VerifyReport:
-    findings = [Finding("structure", fault, _number(name)) for name, fault in faults.items()]
-    faulty = {number for number in map(_number, faults) if number is not None}
+    findings = [Finding("structure", fault, episode_number(name)) for name, fault in faults.items()]
+    faulty = {number for number in map(episode_number, faults) if number is not None}
     findings += _looked_at("structure", None, lambda: _structure_findings(dataset, dataset_id, faulty))
     hashed, changed = _hash_findings(folder)
     findings += changed
@@ -175,12 +176,6 @@ def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[
         findings += _looked_at("alignment", number, lambda episode=episode: _episode_findings(dataset, episode))  # type: ignore[misc]
     findings += _looked_at("structure", None, lambda: _count_findings(dataset, steps))
     return VerifyReport(dataset_id, dataset.total_episodes, max(steps, 0), hashed, tuple(findings))
-
-
-def _number(group: str) -> int | None:
-    """The number of an episode's group; None for a group of another name."""
-    digits = group.removeprefix("episode_")
-    return int(digits) if group != digits and digits.isdecimal() and len(digits) < 19 else None
 
 
 def _looked_at(check: str, episode: int | None, find: Callable[[], Iterable[Finding]]) -> list[Finding]:
@@ -252,8 +247,11 @@ def _hdf5_findings(file: h5py.File, episodes: int, faulty: Set[int]) -> Iterator
         number = int(name[8:])
         if number in faulty:
             continue
-        found = int(file[name].attrs.get("id", number))
-        if found in seen:
+        stored = file[name].attrs.get("id", number)
+        found = int(stored)
+        if found != stored:
+            yield Finding("structure", f"expected an integer as its id, got {stored}", number)
+        elif found in seen:
             yield Finding("structure", f"expected an episode id of its own, got {found} as in {seen[found]}", number)
         elif found != number:
             yield Finding("structure", f"expected the episode id {number}, got {found}", number)
