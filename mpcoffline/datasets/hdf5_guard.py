@@ -15,8 +15,6 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import h5py
-
 from mpcoffline.core.files import check_regular
 from mpcoffline.core.limits import EXPANSION, EXPANSION_ALLOWANCE, GROUP_DEPTH, LINK_BYTES
 from mpcoffline.errors import FileFormatError
@@ -77,6 +75,8 @@ def episode_number(group: str) -> int | None:
 
 
 def _looked_over(path: Path) -> dict[str, tuple[int, FileFormatError | None]]:
+    import h5py
+
     check_regular(path)
     try:
         with (
@@ -169,6 +169,8 @@ class _Walk:
             names = self._word(heap + 24)
             leaves = self._leaves(where, tree, kind=0, width=16)
             return [member for leaf in leaves for member in self._symbols(where, self._word(leaf + 8), names)]
+        import h5py
+
         found: list[tuple[str, int]] = []
 
         def collect(name: bytes, info: Any) -> bool | None:
@@ -276,6 +278,8 @@ class _Walk:
 
     def _check_texts(self, where: str) -> None:
         """Counts the bytes of texts, which stand elsewhere in the file, and may all be the same."""
+        import h5py
+
         array = self._file[where]
         if array.id.get_type().get_class() != h5py.h5t.VLEN and array.id.get_type().get_class() != h5py.h5t.STRING:
             if array.id.get_type().detect_class(h5py.h5t.VLEN):
@@ -294,6 +298,8 @@ class _Walk:
 
     def _other_array(self, where: str) -> tuple[int, ...]:
         """The same for an array in another of HDF5's forms."""
+        import h5py
+
         array = self._file[where]
         if array.is_virtual or array.external:
             raise self._refused(where, "data in this file", "some in another")

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mpcoffline.errors import FileFormatError
+from mpcoffline.errors import FileFormatError, StorageError
 
 from .hdf5_guard import episode_number
 from .manifest import MANIFEST, differences, write_manifest
@@ -134,6 +134,7 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
     Raises:
         InvalidArgumentError: For an id against Minari's grammar.
         UnknownIdError: For the id of no data set here.
+        StorageError: Where the new manifest cannot be written.
     """
     if not isinstance(dataset, str) and hasattr(dataset, "iterate_episodes"):
         dataset_id, folder = str(dataset.spec.dataset_id), Path(dataset.spec.data_path).parent
@@ -153,7 +154,12 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
     serious = {finding.check for finding in report.findings if finding.serious}
     if not accept or serious != {"hash"}:
         return report
-    write_manifest(folder)
+    try:
+        write_manifest(folder)
+    except FileFormatError as error:
+        return replace(report, findings=(*report.findings, Finding("hash", f"not accepted: {error}")))
+    except OSError as error:
+        raise StorageError.of(folder / MANIFEST, error) from error
     kept = tuple(replace(f, serious=False) if f.check == "hash" else f for f in report.findings)
     return replace(report, findings=(*kept, Finding("hash", f"accepted: {MANIFEST} is written anew", serious=False)))
 

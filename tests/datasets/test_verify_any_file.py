@@ -32,7 +32,7 @@ ARRAYS: dict[str, Callable[[Any], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("column", ["observations", "actions", "rewards", "terminations", "infos/cost", "infos/state"])
+@pytest.mark.parametrize("column", ["observations", "rewards", "terminations", "infos/cost"])
 @pytest.mark.parametrize("kind", ARRAYS)
 def test_arrays_of_any_kind(store: Path, column: str, kind: str) -> None:
     stored(episodes=recorded(episodes=3))
