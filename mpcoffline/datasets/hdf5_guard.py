@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import math
 import mmap
+import re
 import struct
 from pathlib import Path
 from typing import Any
-
-import h5py
 
 from mpcoffline.core.files import check_regular
 from mpcoffline.core.limits import EXPANSION, EXPANSION_ALLOWANCE, GROUP_DEPTH, LINK_BYTES
@@ -31,6 +30,7 @@ _ONE_LEAF = (b"TREE\0\0\1\0", b"TREE\1\0\1\0")  # a tree of one entry, of a grou
 
 _CONTINUATIONS = 256
 
+_EPISODE = re.compile(r"episode_(0|[1-9][0-9]{0,17})")
 _FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, OverflowError, struct.error)
 
 _Messages = dict[int, int]
@@ -68,7 +68,15 @@ def check_episodes(path: Path) -> dict[str, str]:
     return {name: "" if fault is None else str(fault).rstrip(".") for name, (_, fault) in _looked_over(path).items()}
 
 
+def episode_number(group: str) -> int | None:
+    """The number of an episode's group; None for a group of another name."""
+    match = _EPISODE.fullmatch(group)
+    return None if match is None else int(match[1])
+
+
 def _looked_over(path: Path) -> dict[str, tuple[int, FileFormatError | None]]:
+    import h5py
+
     check_regular(path)
     try:
         with (
@@ -161,6 +169,8 @@ class _Walk:
             names = self._word(heap + 24)
             leaves = self._leaves(where, tree, kind=0, width=16)
             return [member for leaf in leaves for member in self._symbols(where, self._word(leaf + 8), names)]
+        import h5py
+
         found: list[tuple[str, int]] = []
 
         def collect(name: bytes, info: Any) -> bool | None:
@@ -268,6 +278,8 @@ class _Walk:
 
     def _check_texts(self, where: str) -> None:
         """Counts the bytes of texts, which stand elsewhere in the file, and may all be the same."""
+        import h5py
+
         array = self._file[where]
         if array.id.get_type().get_class() != h5py.h5t.VLEN and array.id.get_type().get_class() != h5py.h5t.STRING:
             if array.id.get_type().detect_class(h5py.h5t.VLEN):
@@ -286,6 +298,8 @@ class _Walk:
 
     def _other_array(self, where: str) -> tuple[int, ...]:
         """The same for an array in another of HDF5's forms."""
+        import h5py
+
         array = self._file[where]
         if array.is_virtual or array.external:
             raise self._refused(where, "data in this file", "some in another")

@@ -284,7 +284,7 @@ def _check(staged: Path, dataset_id: str, source: Source, *, unchecked: bool) ->
                 hint="Run it again to fetch it once more; if that repeats, the remote's copy is damaged.",
             )
     try:
-        found = open_dataset(staged, sums=False).spec.dataset_id
+        found = open_dataset(staged).spec.dataset_id
     except FileFormatError:
         shutil.rmtree(staged)
         raise

@@ -24,7 +24,7 @@ from mpcoffline.core.text import visible
 from mpcoffline.errors import FileFormatError, StorageError, UnknownIdError
 
 from .atomic import publish
-from .hdf5_guard import check_episodes
+from .hdf5_guard import check_episodes, episode_number
 from .manifest import MANIFEST, differences
 from .minari_store import check_dataset_id, dataset_path, finish, is_local, list_datasets, recording_of
 from .opening import DATA_FILE, check_space, open_dataset
@@ -200,7 +200,7 @@ def _inspect(file: Any, path: Path) -> tuple[list[str], list[str]]:
         checked = check_episodes(path)
     except (OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
-    numbered = {int(name[8:]): name for name in checked if name.startswith("episode_") and name[8:].isdecimal()}
+    numbered = {number: name for name in checked if (number := episode_number(name)) is not None}
     for _, name in sorted(numbered.items()):
         reason = checked[name]
         try:

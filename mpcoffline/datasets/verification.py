@@ -13,8 +13,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mpcoffline.core.text import visible
-from mpcoffline.errors import FileFormatError
+from mpcoffline.errors import FileFormatError, StorageError
 
+from .hdf5_guard import episode_number
 from .manifest import MANIFEST, differences, write_manifest
 from .minari_store import check_dataset_id, dataset_path, is_local, load_dataset
 from .opening import DATA_FILE, faults_of, open_to_examine
@@ -135,6 +136,7 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
     Raises:
         InvalidArgumentError: For an id against Minari's grammar.
         UnknownIdError: For the id of no data set here.
+        StorageError: Where the new manifest cannot be written.
     """
     if not isinstance(dataset, str) and hasattr(dataset, "iterate_episodes"):
         dataset_id, folder = str(dataset.spec.dataset_id), Path(dataset.spec.data_path).parent
@@ -154,14 +156,19 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
     serious = {finding.check for finding in report.findings if finding.serious}
     if not accept or serious != {"hash"}:
         return report
-    write_manifest(folder)
+    try:
+        write_manifest(folder)
+    except FileFormatError as error:
+        return replace(report, findings=(*report.findings, Finding("hash", f"not accepted: {error}")))
+    except OSError as error:
+        raise StorageError.of(folder / MANIFEST, error) from error
     kept = tuple(replace(f, serious=False) if f.check == "hash" else f for f in report.findings)
     return replace(report, findings=(*kept, Finding("hash", f"accepted: {MANIFEST} is written anew", serious=False)))
 
 
 def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[str, str]) -> VerifyReport:
-    findings = [Finding("structure", fault, _number(name)) for name, fault in faults.items()]
-    faulty = {number for number in map(_number, faults) if number is not None}
+    findings = [Finding("structure", fault, episode_number(name)) for name, fault in faults.items()]
+    faulty = {number for number in map(episode_number, faults) if number is not None}
     findings += _looked_at("structure", None, lambda: _structure_findings(dataset, dataset_id, faulty))
     hashed, changed = _hash_findings(folder)
     findings += changed
@@ -177,12 +184,6 @@ def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[
         findings += _looked_at("alignment", number, lambda episode=episode: _episode_findings(dataset, episode))  # type: ignore[misc]
     findings += _looked_at("structure", None, lambda: _count_findings(dataset, steps))
     return VerifyReport(dataset_id, dataset.total_episodes, max(steps, 0), hashed, tuple(findings))
-
-
-def _number(group: str) -> int | None:
-    """The number of an episode's group; None for a group of another name."""
-    digits = group.removeprefix("episode_")
-    return int(digits) if group != digits and digits.isdecimal() and len(digits) < 19 else None
 
 
 def _looked_at(check: str, episode: int | None, find: Callable[[], Iterable[Finding]]) -> list[Finding]:
@@ -254,8 +255,11 @@ def _hdf5_findings(file: h5py.File, episodes: int, faulty: Set[int]) -> Iterator
         number = int(name[8:])
         if number in faulty:
             continue
-        found = int(file[name].attrs.get("id", number))
-        if found in seen:
+        stored = file[name].attrs.get("id", number)
+        found = int(stored)
+        if found != stored:
+            yield Finding("structure", f"expected an integer as its id, got {stored}", number)
+        elif found in seen:
             yield Finding("structure", f"expected an episode id of its own, got {found} as in {seen[found]}", number)
         elif found != number:
             yield Finding("structure", f"expected the episode id {number}, got {found}", number)

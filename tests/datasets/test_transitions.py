@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from minari.data_collector import EpisodeBuffer
+from pendulum_data import resealed
 
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.minari_store import write_dataset
@@ -255,10 +256,12 @@ def test_from_minari_names_data_set_episode_and_step() -> None:
     path = Path(dataset.spec.data_path) / "main_data.hdf5"
     with h5py.File(path, "a") as file:
         file["episode_1/rewards"][1] = np.nan
+    resealed("test/table-v0")
     with pytest.raises(InvalidDataError, match=r"data set 'test/table-v0', episode 1, step 1: cost: expected a finite"):
         TransitionTable.from_minari(dataset)
     with h5py.File(path, "a") as file:
         file["episode_1/observations"].resize(3, axis=0)
+    resealed("test/table-v0")
     with pytest.raises(InvalidDataError, match="episode 1: observations: expected the length that belongs to 3"):
         TransitionTable.from_minari(dataset)
 
