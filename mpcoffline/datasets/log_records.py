@@ -87,10 +87,11 @@ class LoggedEpisode:
         """Takes over the arrays of Minari's buffer; ``InvalidDataError`` where one is not of numbers."""
         infos = {f"infos/{key}": value for key, value in (buffer.infos or {}).items()}
         columns = {key: getattr(buffer, key) for key in ("observations", *_STEPS)}
-        named = (columns | infos).items()
-        return cls(
-            sequence, complete, {key: check_numbers(f"episode {sequence}: {key}", value) for key, value in named}
-        )
+        arrays = {key: np.asarray(value) for key, value in (columns | infos).items()}
+        for key, values in arrays.items():
+            if values.dtype.kind not in NUMBERS:
+                check_numbers(f"episode {sequence}: {key}", values)
+        return cls(sequence, complete, arrays)
 
     def __len__(self) -> int:
         """Number of transitions."""
