@@ -136,7 +136,7 @@ def evaluate(
     given = opened(env)
     rule, cap = PlantInfo("evaluate", cost_key), step_cap(given, max_episode_steps)
     try:
-        check_spaces(policy, given)
+        check_spaces(policy, given, narrower=is_mpc(policy))
         if is_mpc(policy):
             check_units(given)
         actor, our_task = in_units(policy), isinstance(given.unwrapped, ControlTask)

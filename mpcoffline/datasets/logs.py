@@ -96,7 +96,7 @@ def record(
     check_integers(1, n_episodes=n_episodes)
     first_seed = None if seed is None else checked_seed("seed", seed)
     made = opened(env)
-    check_spaces(policy, made)
+    check_spaces(policy, made, narrower=True)
     check_units(made)
     actor = in_units(policy)
     cap, rule = step_cap(made, max_episode_steps), PlantInfo("record", cost_key)

@@ -133,10 +133,15 @@ def common_spec(name: str, specs: Sequence[EnvSpec | None]) -> EnvSpec | None:
     return plain[0]
 
 
-def check_spaces(policy: Any, env: Any) -> None:
+def check_spaces(policy: Any, env: Any, *, narrower: bool = False) -> None:
     """Refuses an environment (or ``VecEnv``) that a policy was not made for, or cannot act in.
 
     A policy that says nothing of its spaces is taken at its word.
+
+    Args:
+        policy: The policy.
+        env: The environment.
+        narrower: Whether the policy may keep to a part of the actions; where wrappers that rescale are looked for, too.
 
     Raises:
         InvalidArgumentError: For spaces of another kind, shape or bounds, or gymnasium's ``NormalizeObservation``
@@ -151,6 +156,8 @@ def check_spaces(policy: Any, env: Any) -> None:
         )
     for name in ("observation_space", "action_space"):
         own, given = getattr(policy, name, None), getattr(env, name)
+        if name == "action_space" and narrower and _is_part(own, given):
+            continue
         if isinstance(own, spaces.Space) and not _fits(own, given, free=name == "observation_space"):
             raise InvalidArgumentError(
                 f"env.{name}",
@@ -264,6 +271,15 @@ def _fits(own: spaces.Space[Any], given: object, *, free: bool) -> bool:
     unknown = free and not (own.bounded_below | own.bounded_above).any()
     close = (np.allclose(a, b, rtol=1e-6, atol=0.0) for a, b in ((own.low, given.low), (own.high, given.high)))
     return unknown or all(close)
+
+
+def _is_part(own: object, given: object) -> bool:
+    """Whether all of a Box lies in another one, but for rounding to float32."""
+    if not (isinstance(own, spaces.Box) and isinstance(given, spaces.Box) and own.shape == given.shape):
+        return False
+    low = (own.low >= given.low) | np.isclose(own.low, given.low, rtol=1e-6, atol=0.0)
+    high = (own.high <= given.high) | np.isclose(own.high, given.high, rtol=1e-6, atol=0.0)
+    return bool((low & high).all())
 
 
 def _rescaled(env: Env, name: str, expected: str, actual: str) -> InvalidArgumentError:

@@ -13,6 +13,7 @@ from mpcoffline.errors import FileFormatError, InvalidArgumentError, StorageErro
 from .episode_log import LogIndex
 from .log_records import LogHeader
 from .minari_store import dataset_path, is_local, recording_of
+from .opening import read_metadata
 from .recording_lock import log_files
 
 
@@ -78,7 +79,7 @@ def check_extends(header: LogHeader) -> None:
     """Refuses a recording that is to extend the data set of another plant, which stays as it is."""
     if header.mode != "extend" or not is_local(header.dataset_id):
         return
-    stored = json.loads((dataset_path(header.dataset_id) / "data" / "metadata.json").read_text(encoding="utf-8"))
+    stored = read_metadata(dataset_path(header.dataset_id))
     pairs = {
         "environment": _plants(stored.get("env_spec"), header.env_spec),
         "observation space": (stored.get("observation_space"), header.observation_space),

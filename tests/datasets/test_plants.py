@@ -160,11 +160,20 @@ def test_a_policy_of_other_spaces_is_refused(name: str, mpc_policy: MPCPolicy) -
 
 def test_bounds_of_small_units_are_told_apart() -> None:
     policy = Zero()
-    policy.action_space = spaces.Box(-1e-9, 1e-9, (1,), np.float32)  # type: ignore[attr-defined]
+    policy.action_space = spaces.Box(-2e-9, 2e-9, (1,), np.float32)  # type: ignore[attr-defined]
     plant = Drift()
-    plant.action_space = spaces.Box(-2e-9, 2e-9, (1,), np.float32)
+    plant.action_space = spaces.Box(-1e-9, 1e-9, (1,), np.float32)
     with pytest.raises(InvalidArgumentError, match=r"env\.action_space"):
         evaluate(policy, plant, 1)
+
+
+def test_an_mpc_may_keep_to_a_part_of_the_actions(mpc_policy: MPCPolicy) -> None:
+    plant = Drift()
+    own = mpc_policy.action_space
+    assert isinstance(own, spaces.Box)
+    plant.action_space = spaces.Box(own.low - 1.0, 3.0 * own.high, own.shape, np.float32)
+    assert evaluate(mpc_policy, plant, 2).cost.shape == (2,)
+    assert record(plant, mpc_policy, 1, "test/part-v0").total_episodes == 1
 
 
 # ---------------------------------------------------------------- statistics
