@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from mpcoffline.cli import app
+from mpcoffline.datasets import dataset_from_arrays
 
 SHIPPED = "mpcoffline/linear/ddpg-v0"
 
@@ -16,6 +18,7 @@ SHIPPED = "mpcoffline/linear/ddpg-v0"
 @pytest.fixture(autouse=True)
 def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "minari").mkdir()
     monkeypatch.delenv("MINARI_REMOTE", raising=False)
 
@@ -88,3 +91,13 @@ def test_show_as_json_has_the_numbers() -> None:
     assert summary["dataset_id"] == SHIPPED
     lengths = next(row for row in summary["statistics"] if row["name"] == "steps of an episode")
     assert lengths["mean"] == 100.0
+
+
+def test_what_was_changed_on_purpose_is_accepted(tmp_path: Path) -> None:
+    dataset_from_arrays("mine/log-v0", [(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros(3))])
+    metadata = tmp_path / "minari" / "mine" / "log-v0" / "data" / "metadata.json"
+    metadata.write_text(json.dumps(json.loads(metadata.read_text()) | {"description": "mine"}))
+    assert run("verify", "mine/log-v0")[0] == 1
+    code, output = run("verify", "mine/log-v0", "--accept")
+    assert (code, "accepted" in output) == (0, True)
+    assert run("verify", "mine/log-v0")[0] == 0
