@@ -139,7 +139,7 @@ class _Losses:
 
     def add(self, values: Floats, errors: Floats) -> None:
         self.moments.add(values)
-        self._squares += np.square(errors).sum(axis=0)
+        self._squares += np.einsum("ij,ij->j", errors, errors)
 
     @property
     def far(self) -> NDArray[np.bool_]:

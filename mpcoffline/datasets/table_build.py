@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator
@@ -205,7 +206,7 @@ def row_blocks(
     for episode_id, columns in _episodes(dataset):
         where = f"{name}, episode {episode_id}"
         _check_shapes(where, columns, ny, nu)
-        if exact is None and (centring is not None or _is_wide(columns)):
+        if exact is None and (centring is not None or _is_wide(columns.observations.dtype, columns.actions.dtype)):
             exact = np.empty((size, width))
             exact[:filled] = rows[:filled]
             exact[:filled, ny + nu] = costs[:filled]
@@ -226,9 +227,10 @@ def row_blocks(
         yield block()
 
 
-def _is_wide(columns: EpisodeColumns) -> bool:
-    """Whether observations or actions may have more digits than float32 has."""
-    return not all(np.can_cast(part.dtype, np.float32) for part in (columns.observations, columns.actions))
+@functools.cache
+def _is_wide(*dtypes: np.dtype[Any]) -> bool:
+    """Whether numbers of some of these types may have more digits than float32 has."""
+    return not all(np.can_cast(dtype, np.float32) for dtype in dtypes)
 
 
 def _episodes(dataset: MinariDataset) -> Iterator[tuple[int, EpisodeColumns]]:

@@ -76,8 +76,9 @@ class Moments:
 
     def add(self, block: Floats) -> None:
         """Takes in rows ``(B, size)``, by the update of Chan, Golub and LeVeque: a large mean does not cancel."""
-        difference, n, count = block.mean(axis=0) - self.mean, len(block), self.count
-        self.squares += block.var(axis=0) * n + difference**2 * count * n / (count + n)
+        along = None if block.shape[1] == 1 else 0  # numpy reduces a single column many times faster as a whole
+        difference, n, count = block.mean(axis=along) - self.mean, len(block), self.count
+        self.squares += block.var(axis=along) * n + difference**2 * count * n / (count + n)
         self.mean, self.count = self.mean + difference * n / (count + n), count + n
 
 

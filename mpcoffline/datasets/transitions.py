@@ -66,6 +66,7 @@ class TransitionTable:
     ) -> None:
         self._rows, self.ny, self.nu, self._episode_ids, self.name = rows, ny, nu, episode_ids, name
         self.centring = Centring.none(ny, nu) if centring is None else centring
+        self._plain = self.centring.is_none
         self._file, self._memory = file, memory
 
     @property
@@ -128,7 +129,7 @@ class TransitionTable:
         Args:
             block: ``(B, 2 ny + nu + 2)``, a numpy array or a torch tensor.
         """
-        return self.centring.columns(block)
+        return split(block, self.ny, self.nu) if self._plain else self.centring.columns(block)
 
     def values(self) -> Columns:
         """All five columns in units, copies in float64."""
