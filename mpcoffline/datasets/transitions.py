@@ -290,11 +290,7 @@ class TransitionTable:
         return self._of_file(file, name or self.name, self._memory)
 
     def check_fits(
-        self,
-        ny: int,
-        nu: int,
-        action_low: ArrayLike | None = None,
-        action_high: ArrayLike | None = None,
+        self, ny: int, nu: int, action_low: ArrayLike | None = None, action_high: ArrayLike | None = None
     ) -> None:
         """Refuses to fit an MPC to data of another plant.
 
@@ -332,7 +328,8 @@ class TransitionTable:
 
     def statistics(self) -> TableStatistics:
         """Mean, standard deviation and range of every column, in float64, in one pass over the table."""
-        return TableStatistics(*(self._row(values) for values in moments(self.rows, self.centring.values)))
+        rows = (values[None, :] for values in moments(self.rows, self.centring.values))
+        return TableStatistics(*(Columns(*(c[0] for c in split(row, self.ny, self.nu))) for row in rows))
 
     def split(self, fraction: float, seed: int) -> tuple[TransitionTable, TransitionTable]:
         """Splits at random by episode, so that no episode is on both sides.
@@ -400,6 +397,3 @@ class TransitionTable:
         return cls(
             file.raw_rows, file.ny, file.nu, file.raw_ids, name, centring=file.centring, file=file, memory=memory
         )
-
-    def _row(self, values: NDArray[np.float64]) -> Columns:
-        return Columns(*(column[0] for column in split(values[None, :], self.ny, self.nu)))
