@@ -133,8 +133,11 @@ def _opened(file: IO[bytes]) -> zipfile.ZipFile:
     signature, *_, bytes_of_list, _, comment = _END.unpack(tail[-_END.size :])
     if signature != b"PK\5\6" or comment or bytes_of_list > limits.DIRECTORY_BYTES or tail.startswith(b"PK\6\7"):
         raise zipfile.BadZipFile("not the end of a zip as mpcoffline writes it")
-    file.seek(0)
-    return zipfile.ZipFile(file)
+    size = file.seek(0, io.SEEK_END)
+    archive = zipfile.ZipFile(file)
+    if any(member.compress_size > size for member in archive.infolist()):  # zipfile would ask for that much memory
+        raise zipfile.BadZipFile("a member that is larger than the file")
+    return archive
 
 
 def _members(archive: zipfile.ZipFile, expected: set[str] | None = None) -> dict[str, zipfile.ZipInfo]:

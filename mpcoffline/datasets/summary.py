@@ -15,6 +15,7 @@ from mpcoffline.core.text import markdown, visible
 from mpcoffline.errors import InvalidDataError
 
 from .cards import PANELS, Axis, coverage_figure
+from .checks import check_numbers
 from .minari_store import load_dataset, shipped_datasets
 from .recipes import catalog_file
 
@@ -158,18 +159,23 @@ def _columns(dataset: MinariDataset) -> dict[str, NDArray[np.float64]]:
         if len(space.shape or ()) != 1:
             raise InvalidDataError(f"{name}: {kind} space", expected="a Box of shape (n,)", actual=str(space))
     parts: dict[str, list[Any]] = {key: [] for key in ("observation", "action", "cost", "state", "J", "length", "ends")}
-    for episode in dataset.iterate_episodes():
-        parts["observation"].append(episode.observations[:-1])
-        parts["action"].append(episode.actions)
-        parts["cost"].append(-episode.rewards)
-        if "state" in (episode.infos or {}):
-            parts["state"].append(episode.infos["state"][:-1])
-        parts["J"].append([-episode.rewards.sum()])
-        parts["length"].append([len(episode.rewards)])
-        parts["ends"].append([float(episode.terminations[-1:].any())])
+    try:
+        for episode in dataset.iterate_episodes():
+            rewards = check_numbers("rewards", episode.rewards).astype(np.float64)
+            parts["observation"].append(check_numbers("observations", episode.observations)[:-1])
+            parts["action"].append(check_numbers("actions", episode.actions))
+            parts["cost"].append(-rewards)
+            if "state" in (episode.infos or {}):
+                parts["state"].append(check_numbers("infos/state", episode.infos["state"])[:-1])
+            parts["J"].append([-rewards.sum()])
+            parts["length"].append([len(rewards)])
+            parts["ends"].append([float(check_numbers("terminations", episode.terminations)[-1:].any())])
+        columns = {key: np.concatenate(arrays).astype(np.float64) for key, arrays in parts.items() if arrays}
+    except (OSError, RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
+        hint = "`mpcoffline datasets verify` says what is wrong."
+        raise InvalidDataError(name, expected="episodes of numbers", actual=str(error)[:300], hint=hint) from error
     if not parts["cost"]:
         raise InvalidDataError(name, expected="at least one episode", actual="none")
-    columns = {key: np.concatenate(arrays).astype(np.float64) for key, arrays in parts.items() if arrays}
     if len(columns.get("state", ())) != len(columns["cost"]):
         columns.pop("state", None)
     return columns

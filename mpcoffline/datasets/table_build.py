@@ -217,7 +217,7 @@ def row_blocks(
                 before = done
             part = slice(filled, filled + count)
             _pack((rows if exact is None else exact)[part], columns, done, ny, nu)
-            np.negative(columns.rewards[done : done + count], out=costs[part], casting="same_kind")
+            _negated(columns.rewards[done : done + count], costs[part])
             ids[part] = episode_id
             filled, done = filled + count, done + count
             if filled == size:
@@ -249,9 +249,14 @@ def _pack(rows: NDArray[np.floating[Any]], columns: EpisodeColumns, start: int, 
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused
         rows[:, :ny] = columns.observations[start:end]
         rows[:, ny : ny + nu] = columns.actions[start:end]
-        np.negative(columns.rewards[start:end], out=rows[:, ny + nu], casting="same_kind")
+        _negated(columns.rewards[start:end], rows[:, ny + nu])
         rows[:, after : after + ny] = columns.observations[start + 1 : end + 1]
         rows[:, after + ny] = columns.terminations[start:end]
+
+
+def _negated(rewards: NDArray[Any], costs: NDArray[np.floating[Any]]) -> None:
+    """Writes minus the rewards, of any type of number: unsigned ones and booleans have no minus of their own."""
+    np.negative(rewards, out=costs, dtype=costs.dtype, casting="same_kind")
 
 
 def _check_shapes(where: str, columns: EpisodeColumns, ny: int, nu: int) -> None:
