@@ -305,7 +305,7 @@ def test_constraints_by_place() -> None:
 @pytest.mark.parametrize(
     ("constraints", "message"),
     [
-        (lambda: Constraint(speed_limit, ""), "name of a constraint: expected a text"),
+        (lambda: Constraint(speed_limit, ""), "name of a constraint: expected from 1 to 100 characters"),
         (
             lambda: Constraint(speed_limit, soft=Penalty()),
             "constraints.soft: expected weights >= 0, one of them positive",
