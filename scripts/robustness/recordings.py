@@ -6,10 +6,11 @@ import json
 import mmap
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import h5py
@@ -82,8 +83,8 @@ class Numbered(gym.Env[Any, Any]):
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 
-    def __init__(self, run: int = 0, copy: int = 0) -> None:
-        self.next, self.serial = run * RUN + copy * COPY, -1
+    def __init__(self) -> None:
+        self.next, self.serial = 0, -1
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         if self.serial >= 0 and self.k == self.length:
@@ -151,6 +152,14 @@ def register() -> None:
             gym.register(name, entry_point=f"{__name__}:{entry.__name__}")
 
 
+def numbered(name: str, run: int, copy: int = 0) -> gym.Env[Any, Any]:
+    """One of these environments; its copies, and those of other runs, are one plant that counts from another number."""
+    env = gym.make(name)
+    plant = cast("Numbered", env.unwrapped)
+    plant.next = run * RUN + copy * COPY
+    return env
+
+
 def with_record(run: int, episodes: int, **options: Any) -> None:
     """Records by ``record``."""
     rng = np.random.default_rng(run)
@@ -158,12 +167,12 @@ def with_record(run: int, episodes: int, **options: Any) -> None:
     def policy(observation: Any) -> Any:
         return rng.uniform(-1, 1, 1).astype(np.float32)
 
-    record(gym.make("Promising-v0", run=run), policy, episodes, ID, seed=run * RUN, **options)
+    record(numbered("Promising-v0", run), policy, episodes, ID, seed=run * RUN, **options)
 
 
 def with_agent(run: int, copies: int, steps: int, rounds: int = 1, **options: Any) -> None:
     """Records what a DDPG agent does that never learns."""
-    env = DummyVecEnv([lambda copy=copy: gym.make(ENV, run=run, copy=copy) for copy in range(copies)])
+    env = DummyVecEnv([lambda copy=copy: numbered(ENV, run, copy) for copy in range(copies)])
     agent = DDPG(
         "MlpPolicy", env, learning_starts=10**9, buffer_size=100, policy_kwargs={"net_arch": [4]}, device="cpu"
     )
@@ -228,6 +237,7 @@ def check_set(promised: Iterable[int], *, allowed: set[int] | None = None) -> Fo
             found.problems.append(f"lost: all {len(wanted)} episodes, there is no data set")
         return found
     seen: list[int] = []
+    steps: Counter[int] = Counter()  # of episodes in parts: the end of a training cuts the one under way in two
     with h5py.File(path, "r") as file:
         for number in range(len(file)):
             group = file[f"episode_{number}"]
@@ -237,9 +247,14 @@ def check_set(promised: Iterable[int], *, allowed: set[int] | None = None) -> Fo
                 found.problems.append(f"mixed: episode {number}: {problem}")
             elif whole:
                 seen.append(serial)
-            elif serial in wanted:
-                found.problems.append(f"lost: episode {serial} is cut off")
+            else:
+                steps[serial] += len(group["rewards"])
         found.stored = len(file)
+    for serial, count in steps.items():
+        if count == length_of(serial):
+            seen.append(serial)
+        elif serial in wanted:
+            found.problems.append(f"lost: episode {serial} is cut off")
     metadata = json.loads((path.parent / "metadata.json").read_text())
     if metadata["total_episodes"] != found.stored:
         found.problems.append(f"wrong: {metadata['total_episodes']} episodes in the metadata, {found.stored} stored")
