@@ -5,8 +5,11 @@ What exists and is no regular file (a device, a FIFO, a socket, a folder) is nev
 
 from __future__ import annotations
 
+import fcntl
 import os
+import re
 import tempfile
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,12 +20,16 @@ from typing import IO
 from mpcoffline.core.files import check_regular
 from mpcoffline.errors import FileFormatError, StorageError
 
+_UNIQUE = re.compile("[0-9a-f]{12}")
+_JUST_NOW = 60.0  # s
+
 
 @contextmanager
 def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     """A new file that takes its name once it is complete and on the disk; until then, what was there stays.
 
-    A symbolic link stays one: what it points to is replaced. Where the old file may not be written, nothing is.
+    A symbolic link stays one: what it points to is replaced. Where the old file may not be written, nothing is. What a
+    killed process has left of the same name goes first.
 
     Args:
         path: Its name.
@@ -34,9 +41,13 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
         StorageError: If what is there is no regular file, or the disk or the file system refuses.
     """
     target = _target(path)
-    temporary = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex[:12]}")
+    begin = f".{target.name[:100]}."
+    temporary = target.with_name(f"{begin}{uuid.uuid4().hex[:12]}")
     try:
+        _remove_abandoned(target.parent, begin)
         with temporary.open("xb") as file:
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX)
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -48,6 +59,17 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
         if isinstance(error, OSError) and not isinstance(error, StorageError):  # which names the temporary file
             raise StorageError.of(path, OSError(error.strerror or str(error))) from error
         raise
+
+
+def _remove_abandoned(folder: Path, begin: str) -> None:
+    """Removes the temporary files that nobody writes any more: the system gives their locks back with their process."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        names = [e.name for e in entries if e.name.startswith(begin) and _UNIQUE.fullmatch(e.name[len(begin) :])]
+        for name in names:
+            with suppress(OSError), (folder / name).open("rb") as file:
+                if time.time() - os.fstat(file.fileno()).st_mtime > _JUST_NOW:  # it may not be locked yet
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    (folder / name).unlink()
 
 
 def write_file(path: str | PathLike[str], content: bytes | str) -> Path:

@@ -126,3 +126,27 @@ def test_read_only_places_are_refused(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(StorageError):
         check_output(tmp_path / "new")
+
+
+def test_what_killed_writers_left_goes_with_the_next_one(tmp_path: Path) -> None:
+    target, others = tmp_path / "p.zip", [tmp_path / ".p.zip.notes", tmp_path / ".q.zip.0123456789ab"]
+    killed = os.fork()
+    if killed == 0:
+        with replaced(target):
+            os._exit(0)  # as a kill would: nothing is tidied up
+    os.waitpid(killed, 0)
+    (left,) = tmp_path.glob(".p.zip.*")
+    for path in others:
+        path.touch()
+    old = 1e9
+    with replaced(target) as file:
+        assert left.exists()  # it could be somebody's who has just begun
+        (own,) = set(tmp_path.glob(".p.zip.*")) - {left, others[0]}
+        os.utime(left, (old, old))
+        os.utime(own, (old, old))
+        write_file(target, b"first")
+        assert not left.exists()
+        assert own.exists()  # its writer lives
+        file.write(b"second")
+    assert target.read_bytes() == b"second"
+    assert sorted(tmp_path.iterdir()) == sorted([target, *others])
