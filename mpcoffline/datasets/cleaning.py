@@ -17,6 +17,7 @@ from mpcoffline.core.scratch import abandoned
 from mpcoffline.errors import UnknownIdError
 
 from .minari_store import dataset_path
+from .recording_lock import empty_recordings, remove_empty
 
 Kind = Literal["leftovers", "caches", "downloads", "backups"]
 
@@ -25,7 +26,7 @@ KINDS_OF_WASTE: dict[Kind, str] = {
     "leftovers": "half-built things of killed processes: nobody reads them",
     "caches": "compiled solvers and tables: they are made again when needed",
     "downloads": "downloads that broke off: they begin anew instead of going on",
-    "backups": "what `datasets repair` kept of damaged data sets: gone for good",
+    "backups": "what repairing kept of damaged data, and recordings that were not continued: gone for good",
 }
 DEFAULT_KINDS: tuple[Kind, ...] = ("leftovers", "caches")
 
@@ -93,7 +94,8 @@ def clean(kinds: Iterable[Kind] = DEFAULT_KINDS, *, remove_found: bool = False) 
 
     Args:
         kinds: What to look for; by default ``"leftovers"`` and ``"caches"``, without which nothing is lost. Also
-            ``"downloads"`` that broke off, and ``"backups"`` that repairing made.
+            ``"downloads"`` that broke off, and ``"backups"``: what repairing kept as it was, and recording of
+            another recording's logs.
         remove_found: Whether it is removed; otherwise it is only looked at.
 
     Returns:
@@ -115,7 +117,10 @@ def clean(kinds: Iterable[Kind] = DEFAULT_KINDS, *, remove_found: bool = False) 
 def _without(waste: Waste) -> Waste:
     if waste.kind == "downloads" and not _is_free(waste.path.with_name(waste.path.name + ".lock")):
         return waste  # begun again meanwhile
-    remove(waste.path)
+    if waste.path in empty_recordings():
+        remove_empty(waste.path)
+    else:
+        remove(waste.path)
     if waste.kind == "backups":
         with suppress(OSError):  # folders of namespaces that are empty now
             os.removedirs(waste.path.parent)
@@ -128,6 +133,8 @@ def _leftovers() -> Iterator[Waste]:
         with suppress(OSError):
             for path in abandoned(place):
                 yield Waste("leftovers", path, disk_size(path))
+    for path in empty_recordings():
+        yield Waste("leftovers", path, disk_size(path))
 
 
 def _caches() -> Iterator[Waste]:
@@ -156,7 +163,7 @@ def _is_free(lock: Path) -> bool:
 def _backups() -> Iterator[Waste]:
     root = dataset_path("") / ".broken"
     for folder, below, _ in os.walk(root):
-        if "data" in below or Path(folder).joinpath("SHA256SUMS").exists():
+        if "data" in below or Path(folder).joinpath("SHA256SUMS").exists() or any(Path(folder).glob("env-*.log")):
             below.clear()
             yield Waste("backups", Path(folder), disk_size(Path(folder)))
 

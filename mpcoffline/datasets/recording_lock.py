@@ -110,7 +110,10 @@ class RecordingLock:
 
     def _opened(self) -> bool:
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:  # somebody tidies up: see remove_empty
+            return False
         fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         # Who held it may have removed the file in the meantime: then it is not the lock any more.
         with contextlib.suppress(FileNotFoundError):
@@ -148,6 +151,38 @@ class RecordingLock:
     def __del__(self) -> None:
         if hasattr(self, "_fd"):
             self._close()
+
+
+def empty_recordings() -> list[Path]:
+    """Folders without a log that killed recorders left, each with all that is below it; nobody holds their locks."""
+
+    def outermost(folder: Path) -> list[Path]:
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        known = all(path.name == "lock" or "building" in path.relative_to(folder).parts for path in files)
+        if known and not any(folder.rglob("env-*.log")) and all(map(_is_free, folder.rglob("lock"))):
+            return [folder]
+        below = [] if any(path.parent == folder for path in files) else sorted(folder.iterdir())
+        return [found for part in below if part.is_dir() for found in outermost(part)]
+
+    root = _store() / ".recording"
+    return outermost(root) if root.is_dir() else []
+
+
+def remove_empty(folder: Path) -> None:
+    """Removes one of :func:`empty_recordings`, but for where somebody has begun to record meanwhile."""
+    for path in sorted(folder.rglob("lock")):
+        with contextlib.suppress(InvalidArgumentError, StorageError):
+            RecordingLock(path.parent.relative_to(_store() / ".recording").as_posix()).release()
+    for path in sorted([folder, *folder.rglob("*")], reverse=True):
+        with contextlib.suppress(OSError):
+            path.rmdir()
+
+
+def _is_free(lock: Path) -> bool:
+    with contextlib.suppress(OSError), lock.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return True
+    return False
 
 
 _OPEN: weakref.WeakSet[RecordingLock] = weakref.WeakSet()

@@ -20,6 +20,7 @@ from mpcoffline.cli import app
 from mpcoffline.core import places
 from mpcoffline.datasets import clean, dataset_from_arrays, list_datasets, load_dataset
 from mpcoffline.datasets.cleaning import Kind
+from mpcoffline.datasets.recording_lock import RecordingLock
 from mpcoffline.errors import UnknownIdError
 
 
@@ -44,7 +45,7 @@ import os, signal
 import numpy as np
 from mpcoffline.datasets import minari_store
 from mpcoffline.datasets import dataset_from_arrays
-minari_store._finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
+minari_store.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
 dataset_from_arrays("mine/plant/log-v0", [(np.zeros((21, 3)), np.zeros((20, 1)), np.zeros(20))])
 """
 
@@ -85,6 +86,7 @@ def filled(machine: Path) -> dict[str, Path]:
             (path / "data").mkdir(parents=True, exist_ok=True)
             path = path / "data" / "file"
         path.write_bytes(bytes(50_000))
+    (paths["recording"] / "env-0000.log").write_bytes(bytes(50_000))
     for name in ("leftover", "leftover table"):
         os.utime(paths[name], (0, 0))
     for name in ("broken off", "going on"):
@@ -143,3 +145,38 @@ def test_another_kind_is_refused() -> None:
     with pytest.raises(UnknownIdError, match="leftovers"):
         clean(cast("list[Kind]", ["leftover"]))
     assert CliRunner().invoke(app, ["clean", "datasets"]).exit_code == 2
+
+
+def test_folders_of_recordings_without_a_log_go_and_others_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    root = tmp_path / ".recording"
+    (root / "killed" / "early-v0").mkdir(parents=True)
+    (root / "killed" / "later-v0").mkdir()
+    (root / "killed" / "later-v0" / "lock").touch()
+    (root / "cut" / "set-v0").mkdir(parents=True)
+    (root / "cut" / "set-v0" / "env-0000.log").write_bytes(b"episodes")
+    held = RecordingLock("alive/set-v0")
+    report = clean(["leftovers"])
+    assert [waste.path for waste in report.found] == [root / "killed"]
+    assert (root / "killed" / "early-v0").exists()
+    clean(["leftovers"], remove_found=True)
+    assert not (root / "killed").exists()
+    assert (root / "cut" / "set-v0" / "env-0000.log").exists()
+    held.release()
+    clean(["leftovers"], remove_found=True)
+    (root / "cut" / "set-v0" / "env-0000.log").unlink()
+    clean(["leftovers"], remove_found=True)
+    assert not root.exists()
+
+
+def test_recordings_that_were_put_aside_are_backups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    kept = tmp_path / ".broken" / "cut" / "set-v0-recording-0"
+    kept.mkdir(parents=True)
+    (kept / "env-0000.log").write_bytes(b"episodes")
+    assert [waste.path for waste in clean(["backups"]).found] == [kept]
+    assert kept.exists()
+    clean(["backups"], remove_found=True)
+    assert not (tmp_path / ".broken").exists()
