@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner, make_solver, nominal_mpc
-from mpcoffline.checks import check_name, checked_seed
+from mpcoffline.checks import check_known, checked_seed
 from mpcoffline.datasets import collect, load_dataset
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.learning.terminal import TERMINAL_KINDS
@@ -42,11 +42,11 @@ def test_names_of_any_type_are_unknown_names(lookup: str, name: Any) -> None:
 
 def test_the_nearest_name_is_proposed_for_texts_alone() -> None:
     with pytest.raises(UnknownIdError, match=r"kind: expected one of network, .*Did you mean 'network'"):
-        check_name("kind", "netwrok", TERMINAL_KINDS)
+        check_known("kind", "netwrok", TERMINAL_KINDS)
     error = UnknownIdError.of("kind", 5, TERMINAL_KINDS)
     assert (error.actual, error.hint) == ("5", "")
     for name in TERMINAL_KINDS:
-        check_name("kind", np.str_(name), TERMINAL_KINDS)
+        check_known("kind", np.str_(name), TERMINAL_KINDS)
 
 
 @pytest.mark.parametrize("kind", [int, np.int32, np.uint64])

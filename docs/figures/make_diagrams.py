@@ -195,7 +195,7 @@ MODULES = {
     "tasks": ("tasks",),
     "mpc": ("mpc",),
     "datasets": ("datasets",),
-    "base": ("errors", "checks", "archive", "parallel"),
+    "base": ("errors", "core", "checks", "archive", "parallel"),
     "envs": ("envs",),
 }
 _ROWS = (20.0, 118.0, 216.0, 314.0, 412.0, 510.0, 608.0)
@@ -223,7 +223,12 @@ BOXES = {
     "mpc": _box(5, 166, 190, "mpc", "what is optimised", "control"),
     "datasets": _box(5, 426, 180, "datasets", "record, store, read", "data"),
     "base": _box(
-        6, 20, 586, "errors, checks, archive, parallel", "imported by every box but envs: no arrows are drawn", "use"
+        6,
+        20,
+        586,
+        "errors, core, checks, archive, parallel",
+        "imported by every box but envs: no arrows are drawn",
+        "use",
     ),
     "envs": _box(6, 630, 330, "envs", "the plants, as Gymnasium environments", "data"),
 }
@@ -238,7 +243,8 @@ ROUTES: dict[tuple[str, str], tuple[float, float, float]] = {
     ("doctor", "solvers"): (67, 210, 18), ("doctor", "datasets"): (67, 450, 10), ("solvers", "mpc"): (261, 261, 18),
     ("learning", "mpc"): (470, 316, 23), ("learning", "datasets"): (540, 540, 18),
     ("plotting", "mpc"): (665, 316, 23), ("tasks", "mpc"): (750, 316, 23), ("tasks", "envs"): (795, 795, 18),
-    ("plotting", "envs"): (695, 695, 18), ("evaluation", "envs"): (915, 915, 18), ("datasets", "envs"): (570, 670, 18),
+    ("plotting", "envs"): (695, 695, 18), ("evaluation", "datasets"): (915, 590, 10),
+    ("evaluation", "solvers"): (860, 330, 10), ("datasets", "envs"): (570, 670, 18),
 }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
@@ -21,7 +22,7 @@ from .checks import check_storable
 from .episode_log import EpisodeLog, LogIndex, scan
 from .log_records import LoggedEpisode, LogHeader
 from .minari_store import check_new_dataset, dataset_path, is_local, recording_of, write_dataset
-from .opening import open_dataset
+from .opening import check_space, open_dataset
 from .recording_lock import RecordingLock, log_files, recording_path
 from .same_recording import are_continued, check_extends, common_header, origin_json, remove_logs, set_aside
 
@@ -225,8 +226,6 @@ def seal(dataset_id: str, *, salvage: bool = False) -> tuple[MinariDataset, list
 
 
 def _seal(dataset_id: str, *, salvage: bool = False) -> tuple[MinariDataset, list[str], Path | None]:
-    from minari.serialization import deserialize_space
-
     indices, lost = _salvaged(dataset_id) if salvage else ([scan(path) for path in log_files(dataset_id)], [])
     if sum(len(index.records) for index in indices) == 0:
         if lost:
@@ -252,9 +251,9 @@ def _seal(dataset_id: str, *, salvage: bool = False) -> tuple[MinariDataset, lis
         write_dataset(
             dataset_id,
             (episode.buffer() for episode in _in_order(indices)),
-            env_spec=None if header.env_spec is None else EnvSpec.from_json(header.env_spec),
-            observation_space=deserialize_space(header.observation_space),
-            action_space=deserialize_space(header.action_space),
+            env_spec=_spec_of(header),
+            observation_space=_space_of(header, "observation_space"),
+            action_space=_space_of(header, "action_space"),
             algorithm_name=header.algorithm_name,
             description=header.description,
             overwrite=header.mode != "new",
@@ -290,6 +289,23 @@ def _try_scan(path: Path) -> LogIndex | None:
         return scan(path, salvage=True)
     except FileFormatError:
         return None
+
+
+def _space_of(header: LogHeader, kind: str) -> spaces.Space[Any]:
+    from minari.serialization import deserialize_space
+
+    text = getattr(header, kind)
+    check_space(f"recording of {header.dataset_id!r}: {kind}", text)
+    space: spaces.Space[Any] = deserialize_space(text)
+    return space
+
+
+def _spec_of(header: LogHeader) -> EnvSpec | None:
+    try:
+        return None if header.env_spec is None else EnvSpec.from_json(header.env_spec)
+    except (ValueError, TypeError, KeyError, AttributeError, gym.error.Error) as error:
+        name = f"recording of {header.dataset_id!r}: env_spec"
+        raise FileFormatError(name, expected="a spec as Gymnasium stores it", actual=repr(error)[:300]) from error
 
 
 def _in_order(indices: list[LogIndex]) -> Iterator[LoggedEpisode]:
