@@ -34,7 +34,7 @@ WRONG = [None, 3, 2.5, True, b"ddp", ["ddp"], {"name": "ddp"}, ("ddp",), np.arra
 
 
 @pytest.mark.parametrize("lookup", LOOKUPS)
-@pytest.mark.parametrize("name", WRONG, ids=repr)
+@pytest.mark.parametrize("name", WRONG, ids=lambda name: type(name).__name__)
 def test_names_of_any_type_are_unknown_names(lookup: str, name: Any) -> None:
     with pytest.raises(UnknownIdError, match=r"expected one of .*, got "):
         LOOKUPS[lookup](name)
