@@ -63,7 +63,8 @@ def test_a_compiler_that_runs_out_is_told(tmp_path: Path, monkeypatch: pytest.Mo
     message = "cc1: out of memory allocating 65536 bytes"
     script.write_text(  # it works for what is small
         f'#!/bin/sh\ncase "$*" in *-E*) exec {real} "$@";; esac\nsource={tmp_path}/source; cat >"$source"\n'
-        f'if grep -q "int trial(double a)" "$source"; then exec {real} "$@" <"$source"; fi\necho "{message}" >&2; exit 1\n'
+        f'if grep -q "int trial(double a)" "$source"; then exec {real} "$@" <"$source"; fi\n'
+        f'echo "{message}" >&2; exit 1\n'
     )
     script.chmod(0o700)
     monkeypatch.setenv("CC", str(script))
