@@ -29,6 +29,7 @@ from mpcoffline.errors import FileFormatError, MPCOfflineError
 
 _VERSION = 1
 _DOCUMENT, _ARRAYS = "mpcoffline.json", "arrays.npz"
+_LOCAL = struct.Struct("<4s5HL")  # how a member begins: its CRC-32 comes last
 _END = struct.Struct("<4s4H2LH")  # the last record of a zip: 22 bytes, and a comment, of which we write none
 _BOX_TYPES = (
     *("float16", "float32", "float64", "bool"),
@@ -135,8 +136,12 @@ def _opened(file: IO[bytes]) -> zipfile.ZipFile:
         raise zipfile.BadZipFile("not the end of a zip as mpcoffline writes it")
     size = file.seek(0, io.SEEK_END)
     archive = zipfile.ZipFile(file)
-    if any(member.compress_size > size for member in archive.infolist()):  # zipfile would ask for that much memory
-        raise zipfile.BadZipFile("a member that is larger than the file")
+    for member in archive.infolist():
+        if member.compress_size > size:  # zipfile would ask for that much memory
+            raise zipfile.BadZipFile("a member that is larger than the file")
+        file.seek(member.header_offset)
+        if _LOCAL.unpack(file.read(_LOCAL.size))[-1] != member.CRC:  # zipfile believes the list alone
+            raise zipfile.BadZipFile("a member whose own CRC-32 is not the one in the list")
     return archive
 
 

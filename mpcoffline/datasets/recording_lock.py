@@ -128,7 +128,8 @@ class RecordingLock:
             return
         if not any(self.folder.glob("env-*.log")):
             shutil.rmtree(self.folder / "building", ignore_errors=True)
-            self._path.unlink(missing_ok=True)
+            for path in (*self.folder.glob("env-*.new"), self._path):  # a log that was not begun
+                path.unlink(missing_ok=True)
             folder = self.folder
             while folder != _store():
                 try:
@@ -158,7 +159,10 @@ def empty_recordings() -> list[Path]:
 
     def outermost(folder: Path) -> list[Path]:
         files = [path for path in folder.rglob("*") if path.is_file()]
-        known = all(path.name == "lock" or "building" in path.relative_to(folder).parts for path in files)
+        known = all(
+            path.name == "lock" or path.match("env-*.new") or "building" in path.relative_to(folder).parts
+            for path in files
+        )
         if known and not any(folder.rglob("env-*.log")) and all(map(_is_free, folder.rglob("lock"))):
             return [folder]
         below = [] if any(path.parent == folder for path in files) else sorted(folder.iterdir())
@@ -170,9 +174,10 @@ def empty_recordings() -> list[Path]:
 
 def remove_empty(folder: Path) -> None:
     """Removes one of :func:`empty_recordings`, but for where somebody has begun to record meanwhile."""
-    for path in sorted(folder.rglob("lock")):
+    held = {path.parent for name in ("lock", "env-*.new") for path in folder.rglob(name)}
+    for path in sorted(held):
         with contextlib.suppress(InvalidArgumentError, StorageError):
-            RecordingLock(path.parent.relative_to(_store() / ".recording").as_posix()).release()
+            RecordingLock(path.relative_to(_store() / ".recording").as_posix()).release()
     for path in sorted([folder, *folder.rglob("*")], reverse=True):
         with contextlib.suppress(OSError):
             path.rmdir()

@@ -297,7 +297,9 @@ def leftovers() -> list[str]:
     """Hidden files and folders in the store and in the caches, by their paths, but for what was kept on purpose."""
     roots = [store(), Path(os.environ["MPCOFFLINE_CACHE"]), Path(os.environ["XDG_CACHE_HOME"])]
     names = [(root, path.relative_to(root)) for root in roots if root.exists() for path in root.rglob(".*")]
-    return sorted({str(path) for _, path in names if path.parts[0] not in (".broken", ".locks")})
+    found = {str(path): root / path for root, path in names if path.parts[0] not in (".broken", ".locks")}
+    inside = {name: [str(p.relative_to(path)) for p in path.rglob("*")] for name, path in found.items()}
+    return [f"{name} ({', '.join(sorted(inside[name])) or 'empty'})" for name in sorted(found)]
 
 
 def fresh(folder: Path) -> None:

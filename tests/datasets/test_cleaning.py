@@ -155,6 +155,8 @@ def test_folders_of_recordings_without_a_log_go_and_others_stay(
     (root / "killed" / "early-v0").mkdir(parents=True)
     (root / "killed" / "later-v0").mkdir()
     (root / "killed" / "later-v0" / "lock").touch()
+    (root / "killed" / "header-v0").mkdir()
+    (root / "killed" / "header-v0" / "env-0000.new").write_bytes(b"half a header")
     (root / "cut" / "set-v0").mkdir(parents=True)
     (root / "cut" / "set-v0" / "env-0000.log").write_bytes(b"episodes")
     held = RecordingLock("alive/set-v0")
