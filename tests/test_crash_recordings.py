@@ -137,11 +137,11 @@ def test_leftovers_are_seen(robustness: Any) -> None:
     recordings, rounds = robustness("recordings"), robustness("rounds")
     for place in (".recording/x", ".building-1", ".broken/kept"):
         (recordings.store() / place).mkdir(parents=True)
-    assert recordings.leftovers() == [".building-1", ".recording"]
+    assert recordings.leftovers() == [".building-1 (empty)", ".recording (x)"]
     case = rounds.Round(random.Random(0), recordings.store().parent)
     if not rounds.can_clean():
         case.swept()
-        assert case.found.problems == ["left: .building-1, .recording"]
+        assert case.found.problems == ["left: .building-1 (empty), .recording (x)"]
 
 
 def test_help(tmp_path: Path) -> None:
