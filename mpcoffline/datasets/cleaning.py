@@ -36,7 +36,7 @@ class Waste:
     """One thing that can go.
 
     Attributes:
-        kind: One of :data:`KINDS_OF_WASTE`.
+        kind: ``"leftovers"``, ``"caches"``, ``"downloads"`` or ``"backups"``.
         path: File or folder.
         size: On the disk, in bytes.
         removed: Whether it is gone now.

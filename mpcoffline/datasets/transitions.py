@@ -31,7 +31,7 @@ class TransitionTable:
     """Transitions (s, a, L, s+, terminated) as one C-contiguous float32 array ``(n, 2 ny + nu + 2)``.
 
     :attr:`rows` and :meth:`batches` are that array, for speed; everything else is in units. Columns that are small
-    against their offset, as a position at 1e6 m, are packed without it (:mod:`mpcoffline.datasets.centring`), and come
+    against their offset, as a position at 1e6 m, are packed without it (``mpcoffline/datasets/centring.py``), and come
     out in float64; all others are float32 views of the rows.
 
     One packed row a transition makes a random minibatch one contiguous gather a row, an order of magnitude
