@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 DATA_FILE = "main_data.hdf5"
 _SETTLED = 100_000_000  # ns; a file changed later than that could change again without another time
 _RECORD_VERSION = 1
+_found_here: dict[Path, str] = {}  # by this process: saves it the record
 _T = TypeVar("_T")
 
 
@@ -291,17 +292,22 @@ def _record(folder: Path) -> Path:
 def _is_known(folder: Path, state: str) -> bool:
     if not state:
         return False
+    if _found_here.get(folder) == state:
+        return True
     try:
-        record = json.loads(read_limited(_record(folder), 1000))
-        return bool(record == {"version": _RECORD_VERSION, "state": state})
+        known = bool(json.loads(read_limited(_record(folder), 1000)) == {"version": _RECORD_VERSION, "state": state})
     except (OSError, ValueError, RuntimeError):
         return False
+    if known:
+        _found_here[folder] = state
+    return known
 
 
 def _remember(folder: Path, state: str) -> None:
     """Only ever saves time: where it cannot be kept, the next reader looks again."""
     if not state:
         return
+    _found_here[folder] = state
     try:
         record = _record(folder)
         record.parent.mkdir(parents=True, exist_ok=True)

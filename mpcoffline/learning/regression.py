@@ -22,7 +22,7 @@ from .potential import Potential
 from .progress import Metrics, Report, silent
 from .refit import refit_cost
 from .value import ValueFunction, cosine
-from .value_network import same_shape
+from .value_network import same_shape, whole_numbers
 
 Array = NDArray[np.float64]
 
@@ -267,7 +267,7 @@ class ParameterTraining:
             FileFormatError: If arrays are missing or of another problem.
         """
         try:
-            attempt, step = (int(n) for n in arrays["steps"].tolist())
+            attempt, step = whole_numbers(arrays["steps"], 2)
             if not (0 <= attempt <= self.config.n_restarts and 0 <= step <= self.n_steps):
                 raise ValueError(f"attempt {attempt}, step {step}")
             z = same_shape(arrays["z"], self._z)

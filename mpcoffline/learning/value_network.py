@@ -200,6 +200,19 @@ class Member:
                 }
 
 
+def whole_numbers(array: NDArray[Any], count: int) -> list[int]:
+    """So many counters of a file, whatever their type.
+
+    Raises:
+        ValueError: If there are more or fewer, or one is no whole number.
+    """
+    found = np.array(array)
+    whole = found.shape == (count,) and found.dtype.kind in "iuf" and bool(np.isfinite(found).all())
+    if not whole or (found != np.floor(found)).any():
+        raise ValueError(f"{found.tolist()!r:.80} instead of {count} whole numbers")
+    return [int(number) for number in found.tolist()]
+
+
 def same_shape(array: NDArray[Any], like: Tensor) -> Tensor:
     """An array of a file as a tensor of the shape, type and device of another; nothing is stretched over it.
 

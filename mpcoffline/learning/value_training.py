@@ -19,7 +19,7 @@ from .progress import Metrics
 from .value_config import ValueConfig, cosine
 from .value_function import ValueFunction, tanh_network
 from .value_methods import Residual, ValueMethod
-from .value_network import Member, same_shape
+from .value_network import Member, same_shape, whole_numbers
 from .value_noise import Stochasticity, estimate_stochasticity
 from .value_units import Units
 
@@ -138,14 +138,13 @@ class ValueTraining:
             FileFormatError: If arrays are missing or of another network.
         """
         try:
-            counters, losses = arrays["counters"].tolist(), arrays["losses"].tolist()
+            step, best_step, skipped = whole_numbers(arrays["counters"], 3)
+            validation_loss, best_loss = arrays["losses"].astype(np.float64).tolist()
             for i, member in enumerate(self._members):
                 member.restore({name[len(f"{i}.") :]: a for name, a in arrays.items() if name.startswith(f"{i}.")})
                 self._best[i].copy_(same_shape(arrays[f"{i}.best"], self._best[i]))
-            step, self._best_step, self._skipped = counters
-            if not self.step <= step <= self.n_steps:
-                raise ValueError(f"step {step} of {self.n_steps}")
-            self._validation_loss, self._best_loss = losses
+            if not (self.step <= step <= self.n_steps and 0 <= best_step <= step and 0 <= skipped <= step):
+                raise ValueError(f"steps {step}, {best_step}, {skipped} of {self.n_steps}")
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise FileFormatError(
                 "state of a value training", expected="that of the same network and method", actual=str(error)
@@ -153,7 +152,8 @@ class ValueTraining:
         # The order of the rows is a function of the seed.
         for _ in range(step - self.step):
             next(self._batches)
-        self.step = step
+        self.step, self._best_step, self._skipped = step, best_step, skipped
+        self._validation_loss, self._best_loss = validation_loss, best_loss
 
     def _batch(self, rows: Tensor) -> Columns:
         return self._units.columns(rows.to(self._device))

@@ -249,11 +249,11 @@ def check_set(promised: Iterable[int], *, allowed: set[int] | None = None) -> Fo
                 seen.append(serial)
             else:
                 steps[serial] += len(group["rewards"])
+                if steps[serial] == length_of(serial):
+                    seen.append(serial)
         found.stored = len(file)
     for serial, count in steps.items():
-        if count == length_of(serial):
-            seen.append(serial)
-        elif serial in wanted:
+        if count != length_of(serial) and serial in wanted:
             found.problems.append(f"lost: episode {serial} is cut off")
     metadata = json.loads((path.parent / "metadata.json").read_text())
     if metadata["total_episodes"] != found.stored:
