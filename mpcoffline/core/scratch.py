@@ -34,7 +34,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
     """
     with suppress(OSError):
         for leftover in abandoned(parent):
-            shutil.rmtree(leftover, ignore_errors=True)
+            remove_abandoned(leftover)
     folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     lock = FileLock(folder / _LOCK, timeout=10.0, thread_local=False)
     try:
@@ -58,9 +58,20 @@ def abandoned(parent: Path) -> list[Path]:
     return [path for path in found if _is_abandoned(path)]
 
 
+def remove_abandoned(folder: Path) -> None:
+    """Removes one of :func:`abandoned`. An empty one goes as such: if its lock has come meanwhile, it stays."""
+    with suppress(OSError):
+        folder.rmdir()
+        return
+    if _is_abandoned(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def _is_abandoned(folder: Path) -> bool:
     try:
-        if not (folder / _LOCK).is_file():  # killed within the first moments, or not there yet
+        if not any(folder.iterdir()):  # killed within the first moments; or its lock comes next, and brings it back
+            return True
+        if not (folder / _LOCK).is_file():
             return time.time() - folder.stat().st_mtime > _HOUR
         with FileLock(folder / _LOCK, timeout=0.0, thread_local=False):
             return True

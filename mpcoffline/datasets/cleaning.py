@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 
 from mpcoffline.core.caches import KINDS, disk_size, entries, remove
 from mpcoffline.core.places import cache_root, temporary_root
-from mpcoffline.core.scratch import abandoned
+from mpcoffline.core.scratch import abandoned, remove_abandoned
 from mpcoffline.errors import UnknownIdError
 
 from .minari_store import dataset_path
@@ -119,6 +119,8 @@ def _without(waste: Waste) -> Waste:
         return waste  # begun again meanwhile
     if waste.path in empty_recordings():
         remove_empty(waste.path)
+    elif waste.kind == "leftovers":
+        remove_abandoned(waste.path)
     else:
         remove(waste.path)
     if waste.kind == "backups":

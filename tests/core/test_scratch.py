@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
-from mpcoffline.core.scratch import PREFIX, abandoned, scratch_folder
+from mpcoffline.core.scratch import PREFIX, abandoned, remove_abandoned, scratch_folder
 
 BUILDER = """
 import os, sys
@@ -63,6 +64,7 @@ def test_a_folder_without_a_lock_is_left_alone_for_an_hour(tmp_path: Path) -> No
     """It may be that its process made it just now; so may links and files of that name be somebody's."""
     young = tmp_path / f"{PREFIX}young"
     young.mkdir()
+    (young / "somebody's").touch()
     (tmp_path / f"{PREFIX}file").write_text("")
     (tmp_path / f"{PREFIX}link").symlink_to(young)
     assert not abandoned(tmp_path)
@@ -73,3 +75,20 @@ def test_a_folder_without_a_lock_is_left_alone_for_an_hour(tmp_path: Path) -> No
 def test_a_folder_that_cannot_be_had_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="none"), scratch_folder(tmp_path / "none"):
         pass
+
+
+def test_an_empty_folder_of_a_process_that_was_killed_at_once_goes(tmp_path: Path) -> None:
+    left = tmp_path / f"{PREFIX}first"
+    left.mkdir()
+    assert abandoned(tmp_path) == [left]
+    with scratch_folder(tmp_path):
+        assert not left.exists()
+
+
+def test_a_lock_that_comes_late_keeps_its_folder(tmp_path: Path) -> None:
+    late = tmp_path / f"{PREFIX}late"
+    late.mkdir()
+    (found,) = abandoned(tmp_path)
+    with FileLock(late / ".lock"):
+        remove_abandoned(found)
+        assert (late / ".lock").exists()

@@ -168,9 +168,9 @@ def test_bounds_of_small_units_are_told_apart() -> None:
 
 
 def test_an_mpc_may_keep_to_a_part_of_the_actions(mpc_policy: MPCPolicy) -> None:
-    mpc_policy.action_space = spaces.Box(-0.5, 1.0, (1,), np.float32)  # of the plant's -2 to 2
-    assert evaluate(mpc_policy, PENDULUM, 2).actions[0].max() <= 1.0
-    assert record(PENDULUM, mpc_policy, 1, "test/part-v0").total_episodes == 1
+    careful = MPCPolicy(mpc_policy.mpc, action_space=spaces.Box(-0.5, 1.0, (1,), np.float32))  # the plant: -2 to 2
+    assert evaluate(careful, PENDULUM, 2).actions[0].max() <= 1.0
+    assert record(PENDULUM, careful, 1, "test/part-v0").total_episodes == 1
 
 
 # ---------------------------------------------------------------- statistics
