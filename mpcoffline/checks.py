@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
+from typing import SupportsInt, cast
 
 from mpcoffline.errors import InvalidArgumentError, UnknownIdError
 
@@ -45,7 +46,7 @@ def checked_seed(name: str, value: object) -> int:
         InvalidArgumentError: For anything but an integer >= 0.
     """
     check_integers(0, **{name: value})
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    return int(cast("SupportsInt", value))
 
 
 def check_number(name: str, value: object, low: float, high: float = math.inf, *, open_low: bool = True) -> None:
