@@ -1,23 +1,29 @@
 """Writing HDF5 files so that a full disk, a quota or Ctrl-C is an exception here and never one inside HDF5.
 
 HDF5 does not survive an error of the system while it closes a file: it frees twice what it could not write, and the
-process dies with all that it holds. So HDF5 writes into a :class:`SteadyFile`, which takes everything: what the
-system refuses is kept in memory for the moment that it takes to stop, and the error is raised afterwards.
+process dies with all that it holds. So HDF5 never meets the disk: a data set is made in memory and then written, in
+one piece; or, where it is large, through a :class:`SteadyFile`, which takes everything: what the system refuses is
+kept in memory for the moment that it takes to stop, and the error is raised afterwards.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 WINDOW = 4 << 20
+IN_MEMORY = 128 << 20  # bytes of episodes
 
 T = TypeVar("T")
 
@@ -189,14 +195,47 @@ def checked(items: Iterable[T], file: SteadyFile) -> Iterator[T]:
 def store_episodes(storage: Any, episodes: Iterable[EpisodeBuffer], *, new: bool) -> None:
     """Minari's ``update_episodes``, with which no full disk and no signal ends the process.
 
+    What is small enough is made in memory, which costs nothing; the rest goes through a :class:`SteadyFile`.
+
     Args:
         storage: Minari's HDF5 storage; not to be used afterwards.
-        episodes: The episodes, taken one at a time, in another thread.
+        episodes: The episodes, taken one at a time (in another thread where they are many).
         new: Whether the storage is empty.
 
     Raises:
         OSError: What the system refused.
     """
+    path = Path(storage._file_path)
+    held: deque[EpisodeBuffer] = deque()
+    rest = iter(episodes)
+    room = IN_MEMORY if new else IN_MEMORY - path.stat().st_size
+    for episode in rest:
+        held.append(episode)
+        room -= _size(vars(episode))
+        if room < 0:
+            break
+    consumed = itertools.chain((held.popleft() for _ in range(len(held))), rest)
+    if room >= 0:
+        _store_in_memory(storage, path, consumed, mode="w" if new else "r+")
+    else:
+        _store_steadily(storage, path, consumed, new=new)
+
+
+def _store_in_memory(storage: Any, path: Path, episodes: Iterable[EpisodeBuffer], *, mode: str) -> None:
+    import h5py
+
+    with h5py.File(path, mode, driver="core", backing_store=False, track_order=True) as file:
+
+        def written_at_last() -> Iterator[EpisodeBuffer]:
+            yield from episodes
+            file.flush()  # and now to the disk, before Minari asks for its size
+            path.write_bytes(file.id.get_file_image())
+
+        storage._file_path = file.id  # which Minari gives to h5py.File
+        storage.update_episodes(written_at_last())
+
+
+def _store_steadily(storage: Any, path: Path, episodes: Iterable[EpisodeBuffer], *, new: bool) -> None:
     import h5py
 
     def job(file: SteadyFile) -> None:
@@ -205,4 +244,13 @@ def store_episodes(storage: Any, episodes: Iterable[EpisodeBuffer], *, new: bool
         storage._file_path = file  # which Minari gives to h5py.File
         storage.update_episodes(checked(episodes, file))
 
-    write_steadily(storage._file_path, job)
+    write_steadily(path, job)
+
+
+def _size(item: Any) -> int:
+    """Bytes of the arrays of an episode, whatever they are nested in."""
+    if isinstance(item, dict):
+        return sum(map(_size, item.values()))
+    if isinstance(item, tuple | list):
+        return sum(map(_size, item))
+    return np.asarray(item).nbytes if item is not None else 0

@@ -11,15 +11,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
-from crashing import DATASET, check_survivors, episode, recording
+from crashing import ACTIONS, DATASET, SPACE, check_survivors, episode, recording
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mpcoffline.datasets import dataset_from_arrays, repair, writing
 from mpcoffline.datasets.packed import pack, packed_size
+from mpcoffline.datasets.recording import Recording
 from mpcoffline.datasets.recording_lock import log_files
 from mpcoffline.datasets.writing import SteadyFile, write_steadily
 from mpcoffline.errors import StorageError
@@ -33,10 +35,19 @@ def limit() -> Iterator[Any]:
     resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.fixture(params=["in memory", "steadily"])
+def route(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Data sets are made in memory, or (as large ones are) through a file that takes everything."""
+    if request.param == "steadily":
+        monkeypatch.setattr(writing, "IN_MEMORY", 0)
+    return str(request.param)
+
+
 def files(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*"))
 
 
+@pytest.mark.usefixtures("route")
 @pytest.mark.parametrize("size", [0, 100, 2_000, 20_000, 200_000])
 def test_storing_arrays_leaves_nothing_behind(size: int, limit: Any, store: Path) -> None:
     rng = np.random.default_rng(0)
@@ -48,6 +59,7 @@ def test_storing_arrays_leaves_nothing_behind(size: int, limit: Any, store: Path
     assert not files(store)
 
 
+@pytest.mark.usefixtures("route")
 @pytest.mark.parametrize("mode", ["new", "extend"])
 def test_sealing_keeps_the_logs_and_repair_gives_everything(mode: str, limit: Any, store: Path) -> None:
     before = 0
@@ -70,6 +82,7 @@ def test_sealing_keeps_the_logs_and_repair_gives_everything(mode: str, limit: An
     assert check_survivors(before + 40) == before + 40
 
 
+@pytest.mark.usefixtures("route")
 def test_a_replaced_data_set_stays(limit: Any) -> None:
     first = recording()
     first.append(0, episode(0), complete=True)
@@ -170,6 +183,7 @@ def test_it_reads_back_what_was_written_whatever_the_disk_says(
                 file.check()
 
 
+@pytest.mark.usefixtures("route")
 def test_repair_needs_room_too(limit: Any, store: Path) -> None:
     recorded = recording()
     for number in range(5):
@@ -180,3 +194,37 @@ def test_repair_needs_room_too(limit: Any, store: Path) -> None:
         repair(DATASET)
     limit(resource.RLIM_INFINITY)
     assert check_survivors(5) == 5
+
+
+def test_both_routes_store_the_same(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for version, limit in enumerate((writing.IN_MEMORY, 2_000, 0)):
+        monkeypatch.setattr(writing, "IN_MEMORY", limit)
+        name = f"test/routes-v{version}"
+        for first in (0, 5):  # new, then more of it
+            more = recording_of(name, "extend" if first else "new")
+            for number in range(first, first + 5):
+                more.append(0, episode(number), complete=True)
+            more.seal()
+    contents = [content(store / f"test/routes-v{version}" / "data" / "main_data.hdf5") for version in range(3)]
+    assert contents[0] == contents[1] == contents[2]
+    assert len(contents[0]) > 10 * 7
+
+
+def recording_of(name: str, mode: str) -> Recording:
+    spec = gym.spec("mpcoffline/PendulumSwingUp-v0")
+    return Recording(name, mode=mode, env_spec=spec, observation_space=SPACE, action_space=ACTIONS)
+
+
+def content(path: Path) -> dict[str, tuple[Any, ...]]:
+    """All that an HDF5 file holds, by name and in its order."""
+    found: dict[str, tuple[Any, ...]] = {}
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        attributes = tuple((key, str(value)) for key, value in item.attrs.items())
+        found[name] = attributes
+        if isinstance(item, h5py.Dataset):
+            found[name] = (*attributes, item.dtype, item.shape, item.maxshape, item.chunks, item[()].tobytes())
+
+    with h5py.File(path) as file:
+        file.visititems(visit)
+    return found
