@@ -53,15 +53,14 @@ def pendulum() -> MPC:
 
 @needs_clang
 @pytest.mark.slow
+@pytest.mark.parametrize("mpc", [pendulum(), tiny()])
 def test_clang_gives_what_gcc_gives(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+    mpc: MPC, cache: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
-    x = np.random.default_rng(0).normal(size=(40, 2))
-    theirs = make_solver(pendulum(), "ddp").solve(x)
+    x = np.random.default_rng(0).normal(size=(40, mpc.model.nx))
+    theirs = make_solver(mpc, "ddp").solve(x)
     monkeypatch.setenv("CC", "clang")
-    ours = make_solver(pendulum())
-    assert ours.name == "ddp"
-    found = ours.solve(x)
+    found = make_solver(mpc, "ddp").solve(x)
     assert found.success.all()
     np.testing.assert_allclose(found.value, theirs.value, rtol=1e-9)
     np.testing.assert_allclose(found.u, theirs.u, atol=1e-5)
