@@ -271,9 +271,9 @@ def _state(folder: Path) -> str:
     """A hash over what the system says of each file: it changes with each of them."""
     lines: list[str] = []
     newest = 0
-    for path in (folder / MANIFEST, *sorted((folder / "data").rglob("*"))):
+    for path in _paths(os.fspath(folder)):
         try:
-            status = path.stat()
+            status = os.stat(path)
         except FileNotFoundError:
             continue
         check_limit(str(folder), "files", len(lines), FOLDER_ENTRIES)
@@ -282,6 +282,19 @@ def _state(folder: Path) -> str:
         lines.append(f"{os.fsencode(path)!r} {numbers}")
     settled = time.time_ns() - newest > _SETTLED
     return hashlib.sha256("\n".join(lines).encode()).hexdigest() if settled else ""
+
+
+def _paths(folder: str) -> Iterator[str]:
+    """The manifest, and all below ``data`` in a fixed order; without pathlib, since this is done at every opening."""
+    yield os.path.join(folder, MANIFEST)
+    folders = [os.path.join(folder, "data")]
+    while folders:
+        try:
+            entries = sorted(os.scandir(folders.pop()), key=lambda entry: entry.name)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        folders += [entry.path for entry in entries if entry.is_dir(follow_symlinks=False)]
+        yield from (entry.path for entry in entries)
 
 
 def _record(folder: Path) -> Path:
