@@ -25,6 +25,8 @@ _SPACE, _TYPE, _EXTERNAL, _LAYOUT, _FILTERS = 0x01, 0x03, 0x07, 0x08, 0x0B
 _CONTINUED, _SYMBOL_TABLE = 0x10, 0x11
 _VLEN_CLASSES = (6, 9, 10)  # compound, variable length, array: may hold what is stored elsewhere
 _NAME_BYTES = 1024
+_NULL = (0,)  # a null array, like a single number, has no shape
+_ROWS = ("observations", "actions", "rewards", "terminations", "truncations")
 _ONE_LEAF = (b"TREE\0\0\1\0", b"TREE\1\0\1\0")  # a tree of one entry, of a group and of chunks
 
 
@@ -147,6 +149,8 @@ class _Walk:
         rows = -1
         for name, target in self._members(where, place, messages):
             found = self._visit(f"{where}/{name}", target, depth - 1)
+            if depth == GROUP_DEPTH and name in _ROWS and found < 0 and target in self._arrays:
+                raise self._refused(f"{where}/{name}", "an array of rows", "one without")
             rows = found if name == "rewards" else rows
         return rows
 
@@ -230,7 +234,7 @@ class _Walk:
             return self._other_array(where)
         space, kind, layout = (messages[key] for key in (_SPACE, _TYPE, _LAYOUT))
         if content[space] == 2 and content[space + 3] == 2:  # a null array
-            return (0, 0)
+            return _NULL
         rank, begin = content[space + 1], space + (8 if content[space] == 1 else 4)
         shape = struct.unpack_from(f"<{rank}Q", content, begin)
         (itemsize,) = struct.unpack_from("<I", content, kind + 4)
@@ -304,7 +308,7 @@ class _Walk:
         if array.is_virtual or array.external:
             raise self._refused(where, "data in this file", "some in another")
         if array.shape is None:
-            return (0, 0)
+            return _NULL
         if array.id.get_type().detect_class(h5py.h5t.VLEN):
             self._check_texts(where)
         size = array.size * array.id.get_type().get_size()

@@ -33,11 +33,13 @@ class Honest:
             other content), ``store/`` (a Minari store), ``tables/`` and ``solvers/`` (caches).
         table: The rows of the data set.
         rows: The rows of the episodes in the logs, as bytes.
+        foreign_rows: Those of the logs in ``other/``.
     """
 
     folder: Path
     table: TransitionTable
     rows: set[bytes]
+    foreign_rows: set[bytes]
 
 
 @contextmanager
@@ -97,6 +99,14 @@ def leave_logs(dataset_id: str, seed: int, episodes: int = EPISODES) -> None:
         record(short_env(), interrupted, episodes + 1, dataset_id, seed=seed)
 
 
+def rows_in_logs(store: Path, copy: Path) -> set[bytes]:
+    """What the logs of a store hold, by repairing a copy of it."""
+    shutil.copytree(store / ".recording", copy / ".recording")
+    with settings(MINARI_DATASETS_PATH=copy):
+        repair(LOGS)
+        return {row.tobytes() for row in TransitionTable.from_minari(LOGS).rows}
+
+
 def make_honest(folder: Path) -> Honest:
     """Makes all of them."""
     store = folder / "store"
@@ -123,13 +133,10 @@ def make_honest(folder: Path) -> Honest:
         for number, place in ((1, store), (2, folder / "other")):
             with settings(MINARI_DATASETS_PATH=place):
                 leave_logs(LOGS, number)
-        copy = folder / "sealed"
-        shutil.copytree(store, copy)
-        with settings(MINARI_DATASETS_PATH=copy):
-            repair(LOGS)
-            rows = {row.tobytes() for row in TransitionTable.from_minari(LOGS).rows}
+        rows = rows_in_logs(store, folder / "sealed")
+        foreign_rows = rows_in_logs(folder / "other", folder / "other" / "sealed")
         with settings(MINARI_DATASETS_PATH=folder / "other"):
             rng = np.random.default_rng(3)
             episode = (rng.normal(size=(STEPS + 1, 4)), rng.normal(size=(STEPS, 2)), rng.normal(size=STEPS))
             dataset_from_arrays(SET, [episode] * EPISODES)
-    return Honest(folder, table, rows)
+    return Honest(folder, table, rows, foreign_rows)

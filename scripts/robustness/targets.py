@@ -298,6 +298,7 @@ def log(honest: Honest, kind: str, folder: Path, rng: random.Random) -> tuple[st
     options = {"salvage": True} if "salvaged" in target else {}
     # Whole records of another recording bear right sums: nobody can tell.
     known = None if what.endswith(("foreign", "header")) else honest.rows
+    known = honest.rows | honest.foreign_rows if what.startswith("splice") else known
     return what, partial(_repaired, honest, LOGS, known, **options)
 
 

@@ -247,3 +247,15 @@ def _small_files(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 _FOLDER = Path()
 _SMALL: dict[str, bytes] = {}
+
+
+@pytest.mark.parametrize("column", ["observations", "actions", "rewards", "terminations", "truncations"])
+@pytest.mark.parametrize("nothing", [h5py.Empty("f8"), 3.0])
+def test_a_column_without_rows_is_refused(column: str, nothing: object, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        group = file.create_group("episode_0")
+        for name in ("observations", "actions", "rewards", "terminations", "truncations"):
+            group[name] = nothing if name == column else np.zeros((3, 1))
+    with pytest.raises(FileFormatError, match=f"/episode_0/{column}: expected an array of rows"):
+        check_hdf5(path)
