@@ -226,7 +226,11 @@ def _open(path: str | Path) -> Any:
         file = h5py.File(path, "r")
     except OSError as error:
         raise _damaged(path, str(error)) from error
-    found = (file.attrs.get("format"), file.attrs.get("version"))
+    try:
+        found = (file.attrs.get("format"), file.attrs.get("version"))
+    except _DAMAGES as error:
+        file.close()
+        raise _damaged(path, f"{type(error).__name__}: {error}") from error
     if found != (FORMAT, VERSION):
         file.close()
         raise FileFormatError(f"file {path}", expected=f"{FORMAT!r} of version {VERSION}", actual=str(found))

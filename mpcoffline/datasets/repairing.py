@@ -263,7 +263,7 @@ def _space(metadata: dict[str, Any], kind: str, group: Any, notes: list[str]) ->
             check_space(kind, stored)
             deserialize_space(stored)
             return stored
-        except (ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, NotImplementedError):
+        except (ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, RuntimeError):
             pass
     from minari.serialization import serialize_space
 

@@ -33,7 +33,7 @@ from .atomic import publish
 from .centring import Centring
 from .manifest import sha256_of
 
-VERSION = 2
+VERSION = 3
 READ_BYTES = 1 << 18
 _ROWS, _IDS, _META = "rows.f32", "episodes.i64", "table.json"
 
@@ -65,6 +65,8 @@ class TableFile:
                 meta = json.loads(meta_file.read(size))
             if meta["version"] != VERSION:
                 raise ValueError(f"version {meta['version']}")
+            if meta.pop("crc") != _crc(meta):
+                raise ValueError(f"{_META} with another CRC-32")
             self.ny, self.nu, n = int(meta["ny"]), int(meta["nu"]), int(meta["rows"])
             self.block_rows, self._crcs = int(meta["block_rows"]), [int(crc) for crc in meta["crcs"]]
             self._ids_crc = int(meta["ids_crc"])
@@ -216,7 +218,8 @@ def write_table(
         meta: dict[str, Any] = {"version": VERSION, "ny": ny, "nu": nu, "rows": total // row_bytes}
         meta |= {"block_rows": block_bytes // row_bytes, "ids_crc": ids_crc}
         meta["centring"] = (centring or Centring.none(ny, nu)).to_json()
-        (folder / _META).write_text(json.dumps({**meta, "crcs": crcs}), encoding="utf-8")
+        meta["crcs"] = crcs
+        (folder / _META).write_text(json.dumps({**meta, "crc": _crc(meta)}), encoding="utf-8")
         for name in (_ROWS, _IDS, _META):
             (folder / name).chmod(0o600)  # whatever the umask: see open_own
     except OSError as error:
@@ -328,6 +331,11 @@ def table_folder(chosen: Path | None) -> Path:
 def default_memory() -> int:
     """A quarter of this machine's memory, in bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
+def _crc(meta: dict[str, Any]) -> int:
+    """The CRC-32 of what describes a table."""
+    return zlib.crc32(json.dumps(meta, sort_keys=True).encode())
 
 
 def _bytes(array: Any) -> memoryview:

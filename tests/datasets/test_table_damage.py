@@ -82,7 +82,17 @@ def test_special_files_in_the_cache_are_replaced(folder: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize(
-    "changes", [{"rows": 10**15}, {"ny": -5}, {"block_rows": 0}, {"rows": float("inf")}, {"crcs": []}, {"version": []}]
+    "changes",
+    [
+        {"rows": 10**15},
+        {"ny": -5},
+        {"block_rows": 0},
+        {"block_rows": 10**30},
+        {"rows": float("inf")},
+        {"crcs": []},
+        {"version": []},
+        {"centring": {"centre": [7.0] * 9, "increments": [0] * 3}},
+    ],
 )
 def test_a_changed_description_is_built_again(folder: Path, changes: dict[str, Any]) -> None:
     meta = json.loads((folder / "table.json").read_text())
