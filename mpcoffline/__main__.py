@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mpcoffline.cli import app
+from mpcoffline.cli.main import app
 
 if __name__ == "__main__":
     app()

@@ -36,7 +36,7 @@ from mpcoffline import (
 )
 from mpcoffline.datasets import record, to_dict, verify
 from mpcoffline.learning import fit_value
-from mpcoffline.learning.value import ValueConfig
+from mpcoffline.learning.value.fit import ValueConfig
 from mpcoffline.solvers import Solution
 
 TASK = "mpcoffline/LinearTracking-v0"

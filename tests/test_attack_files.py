@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 
-from mpcoffline.errors import FileFormatError
+from mpcoffline.core.errors import FileFormatError
 
 ROOT = Path(__file__).parents[1]
 SCRIPT = ROOT / "scripts" / "attack_files"

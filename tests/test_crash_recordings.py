@@ -17,8 +17,8 @@ from typing import Any
 import h5py
 import pytest
 
+from mpcoffline.core.errors import StorageError
 from mpcoffline.datasets import dataset_from_arrays
-from mpcoffline.errors import StorageError
 
 ROOT = Path(__file__).parents[1]
 SCRIPT = ROOT / "scripts" / "crash_recordings"

@@ -12,12 +12,12 @@ from grid_dp import GridOptimum, simulate, start_states
 from numpy.typing import NDArray
 from riccati import optimum
 
+from mpcoffline.control.evaluation import Evaluation, evaluate
+from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.envs.linear_tracking import ACTION_WEIGHT, STATE_WEIGHT, plant_matrices
-from mpcoffline.evaluation import Evaluation, evaluate
-from mpcoffline.learner import OfflineMPCLearner
-from mpcoffline.policy import MPCPolicy
-from mpcoffline.tasks import nominal_mpc
+from mpcoffline.learner.learner import OfflineMPCLearner
+from mpcoffline.plants.nominal import nominal_mpc
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 import mpcoffline
-from mpcoffline import errors
+from mpcoffline.core import errors
 
 
 @pytest.mark.parametrize("name", mpcoffline.__all__)

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mpcoffline.cli import app
-from mpcoffline.datasets.minari_store import shipped_datasets
-from mpcoffline.presets import PRESETS
+from mpcoffline.cli.main import app
+from mpcoffline.datasets.store.local import shipped_datasets
+from mpcoffline.learner.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

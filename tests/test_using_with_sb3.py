@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mpcoffline.learner import PRESETS, LearnerConfig
+from mpcoffline.learner.learner import PRESETS, LearnerConfig
 from mpcoffline.learning import FitConfig, ValueConfig
 
 TEXT = (Path(__file__).parents[1] / "docs" / "using_with_sb3.md").read_text(encoding="utf-8")
@@ -29,7 +29,7 @@ def test_the_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names: dict[str, object] = {"__name__": "__main__"}
     for block in BLOCKS:
         missing = [package for name, package in OPTIONAL.items() if name in block and find_spec(package) is None]
-        if "rl_zoo3" in block or missing:  # the zoo's program reads the command line: tests/test_sb3.py
+        if "rl_zoo3" in block or missing:  # the zoo's program reads the command line: tests/sb3/test_sb3.py
             continue
         shorter = block.replace("1000", "3").replace("n_eval_episodes=10", "n_eval_episodes=2")
         exec(compile(shorter, "using_with_sb3.md", "exec"), names)

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner, make_solver, nominal_mpc
-from mpcoffline.checks import check_known, checked_seed
-from mpcoffline.datasets import collect, load_dataset
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.checks import check_known, checked_seed
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.datasets import load_dataset
+from mpcoffline.gallery import collect
+from mpcoffline.learner.presets import LearnerConfig
 from mpcoffline.learning.terminal import TERMINAL_KINDS
-from mpcoffline.presets import LearnerConfig
-from mpcoffline.study.setups import setup_of
+from mpcoffline.studies.setups import setup_of
 
 MPC = lq_plant.make_mpc()
 LOOKUPS: dict[str, Callable[[Any], Any]] = {

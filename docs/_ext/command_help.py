@@ -11,7 +11,7 @@ from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
 from typer.testing import CliRunner
 
-from mpcoffline.cli import app as program
+from mpcoffline.cli.main import app as program
 
 
 class CommandHelp(Directive):

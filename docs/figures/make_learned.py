@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mpcoffline import MPC, OfflineMPCLearner, TransitionTable, make_solver, nominal_mpc
-from mpcoffline.learning.bellman import BellmanFit
+from mpcoffline.learning.bellman.equation import BellmanFit
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, new_figure, paper_style
 from mpcoffline.plotting.panels import on_plane, task_of
 

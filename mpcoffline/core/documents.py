@@ -11,7 +11,8 @@ from typing import Any
 from mpcoffline.core import limits
 from mpcoffline.core.files import read_limited
 from mpcoffline.core.limits import check_limit
-from mpcoffline.errors import FileFormatError
+
+from .errors import FileFormatError
 
 
 def parsed_json(content: bytes, name: str) -> Any:

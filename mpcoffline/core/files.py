@@ -7,7 +7,8 @@ import stat
 from pathlib import Path
 
 from mpcoffline.core.limits import HOLES, check_limit
-from mpcoffline.errors import FileFormatError
+
+from .errors import FileFormatError
 
 _SMALL = 64 << 20
 

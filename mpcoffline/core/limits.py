@@ -1,13 +1,13 @@
 """How large things in files may be: one table, asked before anything in a file is believed.
 
 A file says how large its contents are; a small file can say so of contents that no machine holds. Each reader compares
-with these limits before it allocates, and refuses by a :class:`~mpcoffline.errors.FileFormatError`. What can be written
-can be read: the same limits hold where objects are made.
+with these limits before it allocates, and refuses by a :class:`~mpcoffline.FileFormatError`. What can be written can
+be read: the same limits hold where objects are made.
 """
 
 from __future__ import annotations
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
+from .errors import FileFormatError, InvalidArgumentError
 
 # JSON documents. One of a model of EXPRESSION_NODES operations is as large as this.
 JSON_BYTES = 32 << 20

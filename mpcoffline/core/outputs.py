@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import IO
 
 from mpcoffline.core.files import check_regular
-from mpcoffline.errors import FileFormatError, StorageError
+
+from .errors import FileFormatError, StorageError
 
 _UNIQUE = re.compile("[0-9a-f]{12}")
 _JUST_NOW = 60.0  # s

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import platformdirs
 
-from mpcoffline.errors import StorageError
+from .errors import StorageError
 
 logger = logging.getLogger(__name__)
 

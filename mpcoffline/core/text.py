@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Iterable
 from functools import lru_cache
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, visible
+from .errors import FileFormatError, InvalidArgumentError, visible
 
 __all__ = ["LONGEST", "c_comment", "c_identifiers", "check_name", "check_unit", "markdown", "markdown_code", "visible"]
 

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from mpcoffline.errors import InvalidArgumentError, InvalidDataError
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 
 NUMBERS = "fiub"  # the kinds of numpy types that a recording can hold
 

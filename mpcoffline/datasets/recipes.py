@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
-from mpcoffline.checks import check_integers, check_known, checked_seed
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.checks import check_integers, check_known, checked_seed
+from mpcoffline.core.errors import InvalidArgumentError
 
 TASKS = ("linear", "pendulum", "cartpole")
 

@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.checks import check_integers
-from mpcoffline.datasets.transitions import TransitionTable
-from mpcoffline.errors import MPCOfflineError
-from mpcoffline.learner import OfflineMPCLearner
+from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.core.checks import check_integers
+from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.smoothing import SmoothedIdentification, identify_smoothed
+from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
-from mpcoffline.learning.smoothing import SmoothedIdentification, identify_smoothed
 from mpcoffline.mpc import MPC
-from mpcoffline.policy import MPCPolicy
+from mpcoffline.simulation.closed_loop import Simulation, initial_states, simulate
+from mpcoffline.simulation.ensemble import Ensemble
+from mpcoffline.simulation.logged_cost import LoggedCost
 
-from .ensemble import Ensemble
-from .logged_cost import LoggedCost
 from .measures import (
     bound_names,
     fit_errors,
@@ -30,7 +31,6 @@ from .measures import (
     value_check,
 )
 from .report import PredictionCheck, Report, Traces
-from .simulation import Simulation, initial_states, simulate
 from .stability import TheoremCheck, closed_loop_eigenvalues, value_growth, weight_checks
 from .verdict import Comparison, decide
 
@@ -57,8 +57,8 @@ def diagnose(
     """Diagnoses a fit from the log alone.
 
     Both controllers, MPC_1 and the learned one, are simulated on an ensemble of models identified from the log (see
-    :class:`~mpcoffline.diagnostics.ensemble.Ensemble`), from initial states of the log, with a stage cost learned from
-    the logged costs (:class:`~mpcoffline.diagnostics.logged_cost.LoggedCost`). That decides the verdict
+    :class:`~mpcoffline.simulation.ensemble.Ensemble`), from initial states of the log, with a stage cost learned from
+    the logged costs (:class:`~mpcoffline.simulation.logged_cost.LoggedCost`). That decides the verdict
     (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
 
     Example:

@@ -10,13 +10,12 @@ import scipy.stats
 import torch
 from numpy.typing import NDArray
 
-from mpcoffline.datasets.transitions import Columns, TransitionTable
+from mpcoffline.datasets.table.transitions import Columns, TransitionTable
+from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman import BellmanFit, variance_of
-from mpcoffline.learning.identification import increments_scale
+from mpcoffline.learning.bellman.equation import BellmanFit, variance_of
 from mpcoffline.mpc import MPC
-
-from .features import RandomFeatures, Ridge
+from mpcoffline.simulation.features import RandomFeatures, Ridge
 
 Array = NDArray[np.float64]
 

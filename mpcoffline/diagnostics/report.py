@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.archive import plain
-from mpcoffline.learning.smoothing import NoiseEstimate
+from mpcoffline.core.archive import plain
+from mpcoffline.estimation.smoothing import NoiseEstimate
 
 from .measures import LagCheck, RegionError, ValueCheck
 from .stability import TheoremCheck, WeightCheck

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.datasets.transitions import TransitionTable
+from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC, QuadraticCost
 from mpcoffline.solvers import Solver

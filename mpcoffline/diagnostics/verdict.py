@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.learning.smoothing import NoiseEstimate
+from mpcoffline.estimation.smoothing import NoiseEstimate
+from mpcoffline.simulation.closed_loop import Simulation
 
 from .measures import LagCheck
-from .simulation import Simulation
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from mpcoffline.checks import check_integers, check_known, check_number
-from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
+from mpcoffline.core.checks import check_integers, check_known, check_number
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
 from mpcoffline.mpc import NetworkCost, QuadraticCost, TerminalCost
 from mpcoffline.mpc.networks import HIDDEN
 

@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.text import check_name
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .expressions import function_from_json, function_to_json, traced
 from .parameters import Array, ParameterSpace

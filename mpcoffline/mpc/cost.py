@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 
 from .component import Component, blocks_from_json, difference, numbers, vector
 from .parameters import Array, Block, ParameterSpace

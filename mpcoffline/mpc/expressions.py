@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from mpcoffline.core import limits
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 _UNARY = (  # noqa: SIM905 -- one per line would fill the page
     "acos acosh asin asinh atan atanh ceil cos cosh erf erfinv exp expm1 fabs floor inv log log1p neg not sign sin sinh"

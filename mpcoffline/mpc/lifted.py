@@ -12,8 +12,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from mpcoffline.checks import check_integers
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.checks import check_integers
+from mpcoffline.core.errors import InvalidArgumentError
 
 from .component import vector
 from .cost import QuadraticCost

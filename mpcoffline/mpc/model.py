@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mpcoffline.checks import check_integers
 from mpcoffline.core import limits
+from mpcoffline.core.checks import check_integers
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 from .component import Component, blocks_from_json
 from .expressions import function_from_json, function_to_json, traced

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 
 from .component import Component, blocks_from_json, difference, vector
 from .cost import QuadraticCost

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core import limits
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.text import LONGEST, check_name, check_unit
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 
 Array = NDArray[np.float64]
 Kind = Literal["free", "psd"]

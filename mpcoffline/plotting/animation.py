@@ -16,8 +16,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.outputs import check_output, write_file
-from mpcoffline.errors import InvalidArgumentError, MPCOfflineError
 
 from .panels import task_of
 from .style import OTHER, STYLES, stem_and_index
@@ -25,7 +25,7 @@ from .style import OTHER, STYLES, stem_and_index
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from mpcoffline.evaluation import Predictor
+    from mpcoffline.control.evaluation import Predictor
 
 Frames = list[NDArray[np.uint8]]
 

@@ -9,7 +9,7 @@ import casadi as ca
 import gymnasium as gym
 import numpy as np
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .panels import TaskLabels, on_plane, task_of

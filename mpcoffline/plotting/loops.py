@@ -15,7 +15,7 @@ from .style import PAGE_WIDTH, legend_handles, new_figure, paper_style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from mpcoffline.evaluation import Evaluation
+    from mpcoffline.control.evaluation import Evaluation
 
 _PANEL_HEIGHT, _LEGEND_HEIGHT = 1.15, 0.55
 

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs import ControlTask
-from mpcoffline.errors import InvalidArgumentError
 
 from .style import Array
 

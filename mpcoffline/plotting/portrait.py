@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mpcoffline.evaluation import Evaluation
+    from mpcoffline.control.evaluation import Evaluation
 
 _LEVELS = 14  # about
 _EXTREME = 99.5  # percentile of V at which its shades end

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpcoffline.errors import MPCOfflineError
+from mpcoffline.core.errors import MPCOfflineError
 
 from .style import PAGE_WIDTH, STYLES, Array, new_figure, paper_style
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mpcoffline.learner import OfflineMPCLearner
+    from mpcoffline.learner.learner import OfflineMPCLearner
 
 _TITLES = {
     "value_loss": "(VALUE): loss of $V_\\phi$",

@@ -8,14 +8,14 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from mpcoffline.checks import check_known
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.checks import check_known
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .ddp import CompilerError, DDPSolver
 from .interface import Plan, Solution, Solver
+from .ipopt.solver import IpoptSolver
 from .lqr import LQRSolver
-from .nlp import IpoptSolver
 from .options import check_options
 
 __all__ = [

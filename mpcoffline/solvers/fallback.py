@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, Plan, Solution, Solver
-from .nlp import IpoptSolver
+from .ipopt.solver import IpoptSolver
 
 logger = logging.getLogger(__name__)
 

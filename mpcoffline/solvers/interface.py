@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 Array = NDArray[np.float64]

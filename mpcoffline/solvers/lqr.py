@@ -10,13 +10,13 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.checks import check_integers
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.checks import check_integers
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .interface import Array, OneAtATime, Plan, Solution, Solver
+from .ipopt.solver import IpoptSolver
 from .linear_quadratic import Extraction, LinearQuadratic, Riccati, misfit
-from .nlp import IpoptSolver
 
 _TOLERANCE = 1e-8
 _INFINITE = 1e30  # daqp's

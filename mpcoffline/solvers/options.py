@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
 
-from mpcoffline.checks import check_number
 from mpcoffline.core import limits
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.checks import check_number
+from mpcoffline.core.errors import InvalidArgumentError
 
 from .starts import N_CANDIDATES
 

@@ -165,7 +165,7 @@ def _in_child(case: Case, seed: int, folder: Path, pipe: int) -> None:
 
 
 def _outcome(read: Callable[[], str]) -> tuple[str, str]:
-    from mpcoffline.errors import MPCOfflineError
+    from mpcoffline.core.errors import MPCOfflineError
 
     try:
         return read(), ""

@@ -16,7 +16,7 @@ import numpy as np
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable, nominal_mpc
 from mpcoffline.datasets import dataset_from_arrays, record, repair
-from mpcoffline.datasets.packed import pack
+from mpcoffline.datasets.store.packed import pack
 
 ENV = "mpcoffline/LinearTracking-v0"
 SET, LOGS, PACKED = "aa/set-v0", "aa/logs-v0", "aa/packed-v0"

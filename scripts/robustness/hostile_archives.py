@@ -338,7 +338,7 @@ def read_name(path: Path, folder: Path) -> str:
 
     policy = MPCPolicy.load(path)
     LIMITS.begin("export", 60, wall=120, room=1 << 30)
-    from mpcoffline.export import export_c
+    from mpcoffline.control.export import export_c
 
     export_c(policy, folder / "c")
     library = folder / "evil.so"

@@ -13,8 +13,9 @@ import h5py
 import numpy as np
 
 from mpcoffline import TransitionTable
-from mpcoffline.datasets import list_datasets, load_dataset, repair, show, verify
-from mpcoffline.errors import MPCOfflineError
+from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.datasets import list_datasets, load_dataset, repair, verify
+from mpcoffline.gallery import show
 
 from .cases import EQUAL, LET_IN, LIMITS, RAW, WRONG, Finding
 from .honest import SET, Honest
@@ -197,7 +198,7 @@ def read_shown(place: Path) -> str:
     """A description that would write on the terminal."""
     from typer.testing import CliRunner
 
-    from mpcoffline.cli import app
+    from mpcoffline.cli.main import app
 
     result = CliRunner().invoke(app, ["datasets", "show", SET])
     if result.exception is not None and not isinstance(result.exception, (SystemExit, MPCOfflineError)):

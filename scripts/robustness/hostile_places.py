@@ -16,9 +16,9 @@ import h5py
 import numpy as np
 
 from mpcoffline import MPCPolicy
+from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.datasets import dataset_from_arrays, list_datasets, verify
-from mpcoffline.datasets.packed import unpack
-from mpcoffline.errors import MPCOfflineError
+from mpcoffline.datasets.store.packed import unpack
 
 from .cases import EQUAL, LET_IN, LIMITS, Finding
 from .honest import PACKED, SET, Honest

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mpcoffline.errors import MPCOfflineError
+from mpcoffline.core.errors import MPCOfflineError
 
 from .recordings import (
     ID,
@@ -161,8 +161,8 @@ class Round:
 
     def repaired(self) -> Ended:
         """Repairs, where there is anything."""
+        from mpcoffline.core.errors import UnknownIdError
         from mpcoffline.datasets import repair
-        from mpcoffline.errors import UnknownIdError
 
         def job() -> None:
             with suppress(UnknownIdError):
@@ -197,7 +197,7 @@ def can_clean() -> bool:
     """Whether there is a command that cleans up."""
     from typer.main import get_group
 
-    from mpcoffline.cli import app
+    from mpcoffline.cli.main import app
 
     return "clean" in get_group(app).commands
 
@@ -209,7 +209,7 @@ def clean() -> None:
 
 def command(*words: str) -> None:
     """A command of the package, in this process."""
-    from mpcoffline.cli import app
+    from mpcoffline.cli.main import app
 
     app(list(words))
 

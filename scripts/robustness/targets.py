@@ -16,7 +16,7 @@ import numpy as np
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner, TransitionTable
 from mpcoffline.datasets import load_dataset, repair, verify
-from mpcoffline.datasets.packed import packed_size, unpack
+from mpcoffline.datasets.store.packed import packed_size, unpack
 
 from . import mutations, mutations_hdf5
 from .cases import EQUAL, LIMITS, OTHER, RAW, REFUSED, WRONG, Case, Finding, status
@@ -246,7 +246,7 @@ def _changed(honest: Honest) -> bool:
 
 
 def _table_outcome(honest: Honest, free: bool) -> tuple[str, Exception | None]:
-    from mpcoffline.errors import MPCOfflineError
+    from mpcoffline.core.errors import MPCOfflineError
 
     try:
         dataset = load_dataset(SET, download=False)
@@ -268,7 +268,7 @@ def _table_outcome(honest: Honest, free: bool) -> tuple[str, Exception | None]:
 
 def _repaired(honest: Honest, dataset_id: str, known: set[bytes] | None, **options: Any) -> str:
     """Repairs; where that succeeds, every row is a known one and none is there twice."""
-    from mpcoffline.errors import MPCOfflineError
+    from mpcoffline.core.errors import MPCOfflineError
 
     try:
         repair(dataset_id, **options)

@@ -13,12 +13,12 @@ import pytest
 from mpc_problems import PENDULUM
 
 from mpcoffline import MPCPolicy
-from mpcoffline.archive import write_archive
+from mpcoffline.control.export import export_c
+from mpcoffline.core.archive import write_archive
+from mpcoffline.core.errors import StorageError
 from mpcoffline.core.outputs import check_output, check_output_folder, replaced, write_file
-from mpcoffline.errors import StorageError
-from mpcoffline.export import export_c
-from mpcoffline.loggers import CSVLogger
-from mpcoffline.tasks import nominal_mpc
+from mpcoffline.learner.loggers import CSVLogger
+from mpcoffline.plants.nominal import nominal_mpc
 
 
 def special_files(folder: Path) -> dict[str, Path]:
@@ -111,7 +111,7 @@ def test_folders_that_take_no_file_are_refused_and_none_is_made(tmp_path: Path) 
 
 
 def test_an_export_is_refused_before_it_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mpcoffline.export.DDPSolver", None)  # which is not asked
+    monkeypatch.setattr("mpcoffline.control.export.DDPSolver", None)  # which is not asked
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError):
         export_c(MPCPolicy(nominal_mpc(PENDULUM)), tmp_path / "file")

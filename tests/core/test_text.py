@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.text import c_comment, c_identifiers, check_name, check_unit, markdown, markdown_code, visible
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 
 names = st.text(st.sampled_from("abgφö²ß_.-^*/()%°µ·[], 019Ω日"), min_size=1, max_size=12).filter(str.strip)
 

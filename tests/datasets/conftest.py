@@ -1,16 +1,5 @@
-"""A Minari store and a cache of its own for every test: the user's are never touched."""
+"""A Minari store of its own for every test."""
 
-from __future__ import annotations
+from own_store import store
 
-from pathlib import Path
-
-import pytest
-
-
-@pytest.fixture(autouse=True)
-def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The empty Minari store of this test."""
-    path = tmp_path / "store"
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(path))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return path
+__all__ = ["store"]

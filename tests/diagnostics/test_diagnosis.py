@@ -13,9 +13,9 @@ from lq_plant import QuadraticValue
 
 import mpcoffline
 from mpcoffline import OfflineMPCLearner, TransitionTable
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
 from mpcoffline.diagnostics import Report, diagnose
-from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
-from mpcoffline.learning.smoothing import with_measurement_noise
+from mpcoffline.estimation.smoothing import with_measurement_noise
 from mpcoffline.mpc import MPC
 
 LOG = episodes(n=40, steps=40)

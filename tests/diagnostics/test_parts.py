@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 from mpcoffline import MPCPolicy
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.diagnostics.ensemble import Ensemble
-from mpcoffline.diagnostics.features import RandomFeatures, Ridge
-from mpcoffline.diagnostics.logged_cost import LoggedCost
 from mpcoffline.diagnostics.measures import (
     bound_names,
     fit_errors,
@@ -24,10 +21,13 @@ from mpcoffline.diagnostics.measures import (
     returns_of,
     value_check,
 )
-from mpcoffline.diagnostics.simulation import initial_states, simulate
 from mpcoffline.diagnostics.stability import closed_loop_eigenvalues, value_growth, weight_checks
-from mpcoffline.learning.identification import identify
+from mpcoffline.estimation.identification import identify
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
+from mpcoffline.simulation.closed_loop import initial_states, simulate
+from mpcoffline.simulation.ensemble import Ensemble
+from mpcoffline.simulation.features import RandomFeatures, Ridge
+from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.solvers import make_solver
 
 Array = NDArray[np.float64]

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpcoffline.diagnostics.measures import LagCheck
-from mpcoffline.diagnostics.simulation import Simulation
 from mpcoffline.diagnostics.verdict import Comparison, decide
-from mpcoffline.learning.smoothing import NoiseEstimate
+from mpcoffline.estimation.smoothing import NoiseEstimate
+from mpcoffline.simulation.closed_loop import Simulation
 
 NO_LAG = LagCheck(0.0, 1.0)
 

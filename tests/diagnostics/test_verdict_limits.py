@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mpcoffline.diagnostics.measures import LagCheck
 from mpcoffline.diagnostics.verdict import Comparison, decide
-from mpcoffline.learning.smoothing import NoiseEstimate
+from mpcoffline.estimation.smoothing import NoiseEstimate
 
 QUIET = NoiseEstimate(np.zeros(2), np.zeros(2), np.ones(2), "repeated")
 

@@ -14,7 +14,7 @@ PAGES = Path(__file__).parents[2] / "docs" / "api"
 PACKAGES = (
     "mpcoffline",
     *(f"mpcoffline.{name}" for name in ("datasets", "diagnostics", "envs", "learning", "mpc", "plotting", "solvers")),
-    "mpcoffline.study",
+    "mpcoffline.studies",
 )
 ENTRY = re.compile(r"^\.\. (?:auto(?:class|function|exception)|py:data):: (mpcoffline[\w.]*)", re.MULTILINE)
 

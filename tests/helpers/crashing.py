@@ -15,10 +15,10 @@ import numpy as np
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
+from mpcoffline.core.errors import UnknownIdError
 from mpcoffline.datasets import repair
-from mpcoffline.datasets.recording import Recording
-from mpcoffline.datasets.recording_lock import log_files
-from mpcoffline.errors import UnknownIdError
+from mpcoffline.datasets.record.recording import Recording
+from mpcoffline.datasets.store.recording_lock import log_files
 
 DATASET = "test/crash-v0"
 SPACE = spaces.Box(-np.inf, np.inf, (2,), np.float32)

@@ -10,8 +10,8 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
-from mpcoffline.datasets.manifest import write_manifest
-from mpcoffline.datasets.minari_store import dataset_path, write_dataset
+from mpcoffline.datasets.store.local import dataset_path, write_dataset
+from mpcoffline.datasets.store.manifest import write_manifest
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 

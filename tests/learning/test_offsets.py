@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from mpcoffline import MPC, Model, OfflineMPCLearner, Parameter, QuadraticCost
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.diagnostics.logged_cost import LoggedCost
 from mpcoffline.diagnostics.measures import one_step_error, outside_support
+from mpcoffline.estimation.identification import identify
+from mpcoffline.estimation.smoothing import estimate_noise, identify_smoothed, with_measurement_noise
 from mpcoffline.learning import ValueFunction
-from mpcoffline.learning.identification import identify
-from mpcoffline.learning.smoothing import estimate_noise, identify_smoothed, with_measurement_noise
 from mpcoffline.learning.terminal import fit_terminal, terminal_error
-from mpcoffline.learning.value_noise import estimate_stochasticity
-from mpcoffline.learning.value_units import Units
+from mpcoffline.learning.value.noise import estimate_stochasticity
+from mpcoffline.learning.value.units import Units
+from mpcoffline.simulation.logged_cost import LoggedCost
 
 Array = NDArray[np.float64]
 FAR = 1e6  # m

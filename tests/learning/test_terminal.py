@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mpcoffline.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
 from mpcoffline.learning.distillation import network, network_jacobian
 from mpcoffline.learning.terminal import DistillConfig, fit_terminal, terminal_error
 from mpcoffline.mpc import NetworkCost, QuadraticCost

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import NormCost, Parameter, QuadraticCost
 from mpcoffline.mpc.cost import cost_from_json
 

@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.envs import ENV_IDS
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc.expressions import _BINARY, _UNARY, function_from_json, function_to_json, traced
-from mpcoffline.tasks import nominal_mpc
+from mpcoffline.plants.nominal import nominal_mpc
 
 
 def roundtrip(function: ca.Function) -> ca.Function:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from lq_plant import QuadraticValue
 from numpy.typing import NDArray
 
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.learning import FitConfig, fit_parameters
 from mpcoffline.mpc import MPC, LiftedCost, Model, NormCost, QuadraticCost, polynomial_features
 from mpcoffline.mpc.cost import cost_from_json

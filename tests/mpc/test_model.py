@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import Model, Parameter
 
 

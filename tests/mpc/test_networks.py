@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.learning import FitConfig, fit_parameters
 from mpcoffline.mpc import MPC, ConvexNetworkCost, Model, NetworkCost, NormCost, QuadraticCost
 from mpcoffline.mpc.cost import cost_from_json
 from mpcoffline.mpc.torch_twin import TorchTwin
+from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import make_solver
-from mpcoffline.tasks import nominal_mpc
 
 Array = NDArray[np.float64]
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc.parameters import Block, Parameter, ParameterSpace, psd_factor
 
 Array = NDArray[np.float64]

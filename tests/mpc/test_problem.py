@@ -11,11 +11,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.envs import ENV_IDS
-from mpcoffline.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC, Constraint, Model, NormCost, Parameter, Penalty, QuadraticCost, StateBounds
 from mpcoffline.mpc.parameters import ParameterSpace
-from mpcoffline.tasks import nominal_mpc
+from mpcoffline.plants.nominal import nominal_mpc
 
 
 def ode(x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:

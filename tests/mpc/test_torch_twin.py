@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs import ENV_IDS
-from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
-from mpcoffline.tasks import nominal_mpc
+from mpcoffline.plants.nominal import nominal_mpc
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.solvers import make_solver
 from mpcoffline.solvers.ddp import elimination

@@ -15,7 +15,7 @@ from hard_plants import always_applied, closed_loop, heater, kinked, limited, re
 from numpy.typing import NDArray
 
 from mpcoffline import MPC, MPCPolicy, make_solver
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.solvers import SOLVERS, Plan, Solution, Solver
 from mpcoffline.solvers.fallback import Fallback, SolverStats
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from riccati import optimum
 from scipy.optimize import minimize
 
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs.linear_tracking import ACTION_WEIGHT, STATE_WEIGHT, plant_matrices
-from mpcoffline.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Constraint, Model, NormCost, QuadraticCost
+from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import IpoptSolver, LQRSolver, Plan
-from mpcoffline.tasks import nominal_mpc
 
 Array = NDArray[np.float64]
 DISCOUNT = 0.9

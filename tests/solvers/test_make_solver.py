@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mpcoffline.solvers as solvers
-from mpcoffline.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.mpc import MPC, Model, NormCost, QuadraticCost, StateBounds
 from mpcoffline.solvers import CompilerError, make_solver
 

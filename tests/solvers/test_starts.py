@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mpc_problems import PENDULUM, random_linear
 
+from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers.starts import N_CANDIDATES, SIZES, candidate_inputs
-from mpcoffline.tasks import nominal_mpc
 
 
 @pytest.mark.parametrize(("nu", "horizon"), [(1, 1), (1, 50), (2, 8), (3, 33)])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from mpc_problems import random_linear
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.solvers import Solver, make_solver
 from mpcoffline.solvers.interface import Array

@@ -16,9 +16,9 @@ import tempfile
 from pathlib import Path
 
 from mpcoffline.core.caches import mark_used, trim
+from mpcoffline.core.errors import MPCOfflineError, StorageError
 from mpcoffline.core.places import cache_folders, open_own, warn_once
 from mpcoffline.core.scratch import scratch_folder
-from mpcoffline.errors import MPCOfflineError, StorageError
 
 from .bounded import MEMORY, ran_out, run_bounded
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from mpcoffline.core import limits
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.expressions import Instruction, expanded
 from mpcoffline.solvers.linear_quadratic import promises_convexity

@@ -8,7 +8,7 @@ from heapq import heapify, heappop, heappush
 
 import casadi as ca
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc.expressions import Instruction, expanded, instructions
 
 # The derivatives of the commonest operations f(a, b); those of the others are CasADi's.

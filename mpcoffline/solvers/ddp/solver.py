@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import Array, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex

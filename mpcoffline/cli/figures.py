@@ -1,0 +1,170 @@
+"""The commands ``mpcoffline plot`` and ``mpcoffline diagnose``: what a fit looks like, and whether to trust it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from mpcoffline.core.errors import InvalidArgumentError
+
+from .common import (
+    Json,
+    LearnerFile,
+    PlantAlpha,
+    check_out,
+    check_out_folder,
+    examples,
+    loaded_learner,
+    made_environment,
+    messages,
+    print_json,
+    say,
+    say_file,
+)
+
+if TYPE_CHECKING:
+    from gymnasium import Env
+
+    from mpcoffline.control.policy import MPCPolicy
+    from mpcoffline.learner.learner import OfflineMPCLearner
+
+app = typer.Typer()
+
+_BROAD_STARTS = 3
+_FILM_SECONDS = 5.0
+_FIGURES = ("training", "cost", "closed_loop", "phase_portrait")
+
+
+@app.command(
+    epilog=examples(
+        "mpcoffline diagnose learner.zip --dataset mpcoffline/pendulum/ddpg-v0",
+        "mpcoffline diagnose learner.zip --dataset mpcoffline/pendulum/ddpg-v0 --out report.png --json",
+    )
+)
+def diagnose(
+    learner: LearnerFile,
+    dataset: Annotated[str, typer.Option(help="The data set that it was learned from.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="Draw the report here (PDF and PNG).", show_default="none", dir_okay=False)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated starts.", min=0)] = 0,
+    as_json: Json = False,
+) -> None:
+    """May this fit be trusted? A verdict from the log alone, with its reasons.
+
+    Simulates MPC_1 and the learned MPC on models identified from the log; takes from seconds to minutes.
+    """
+    from mpcoffline.datasets import load_dataset
+    from mpcoffline.diagnostics import diagnose as examined
+    from mpcoffline.plotting.style import figure_files
+
+    for file in figure_files(out) if out is not None else ():
+        check_out("--out", file)
+    fitted = loaded_learner(learner)
+    data = load_dataset(dataset)
+    with messages.status("Simulating both controllers on models of the log"):
+        report = examined(fitted, data, seed=seed)
+    files = [] if out is None else report.figure(out)
+    if as_json:
+        print_json(json.loads(report.to_json()) | {"files": files})
+        return
+    say(escape(str(report)))
+    for file in files:
+        say_file("Figure", file)
+
+
+@app.command(
+    epilog=examples(
+        "mpcoffline plot learner.zip --out figures/",
+        "mpcoffline plot learner.zip --out figures/ --animate figures/swing_up.gif",
+        "mpcoffline plot learner.zip --env mpcoffline/LinearTracking-v0 --alpha 0.5",
+    )
+)
+def plot(
+    learner: LearnerFile,
+    out: Annotated[Path, typer.Option(help="Folder for the figures.", file_okay=False)] = Path("figures"),
+    env: Annotated[
+        str | None, typer.Option(help="Gymnasium id of the environment.", show_default="the task of the learner's size")
+    ] = None,
+    alpha: PlantAlpha = None,
+    seed: Annotated[int, typer.Option(help="Seed of the first start.", min=0)] = 0,
+    film: Annotated[
+        Path | None,
+        typer.Option("--animate", help="Film of both controllers side by side (.gif or .mp4).", dir_okay=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Draw a learner: training curves, cost before and after, closed loops, phase portrait with V; a film if asked.
+
+    Every figure is written as PDF and PNG. MPC_1 is the nominal controller, MPC_2 or MPC_3 the learned one.
+    """
+    import mpcoffline
+    from mpcoffline import MPCPolicy, plotting
+
+    check_out_folder(out, *(f"{stem}.{suffix}" for stem in _FIGURES for suffix in ("pdf", "png")))
+    fitted = loaded_learner(learner)
+    task = made_environment(env or _task_of(fitted), alpha, None)
+    if film is not None:
+        plotting.check_film(film)
+    name = "MPC_2" if fitted.learn == "cost" else "MPC_3"
+    policies = {"MPC_1": MPCPolicy(fitted.nominal_mpc), name: fitted.policy}
+    starts = _starts(task)
+    with messages.status("Closed loops"):
+        loops = {
+            label: mpcoffline.evaluate(policy, task, len(starts), seed, options=starts)
+            for label, policy in policies.items()
+        }
+    with messages.status("Figures"):
+        figures = {
+            "training": plotting.training_figure(fitted),
+            "cost": plotting.cost_figure(fitted.nominal_mpc, fitted.mpc, task, ("MPC_1", name)),
+            "closed_loop": plotting.loop_figure(loops, task),
+        }
+        if fitted.value_function is not None:
+            figures["phase_portrait"] = plotting.phase_portrait(fitted.value_function.predict, loops, task)
+        files = [file for stem, figure in figures.items() for file in plotting.save_figure(figure, out / stem)]
+    if film is not None:
+        files.append(_filmed(policies, task, loops["MPC_1"].states[0][0], film))
+    if as_json:
+        print_json({"files": files})
+        return
+    for file in files:
+        say_file("Film" if file == film else "Figure", file)
+
+
+def _task_of(learner: OfflineMPCLearner) -> str:
+    """The task with as many states and inputs as the learner; no two have the same."""
+    import gymnasium as gym
+
+    from mpcoffline.envs import ENV_IDS
+
+    sizes = (learner.nominal_mpc.nx,), (learner.nominal_mpc.nu,)
+    for env_id in ENV_IDS:
+        task = gym.make(env_id)
+        if (task.observation_space.shape, task.action_space.shape) == sizes:
+            return env_id
+    raise InvalidArgumentError(
+        "learner",
+        expected=f"one of a task that can be drawn ({', '.join(ENV_IDS)})",
+        actual=f"{sizes[0][0]} states and {sizes[1][0]} inputs",
+    )
+
+
+def _starts(task: Env[Any, Any]) -> list[dict[str, str]]:
+    """The start of each episode: the hardest first, where the task knows one."""
+    from mpcoffline.envs import ControlTask
+
+    known = task.unwrapped.starts if isinstance(task.unwrapped, ControlTask) else ()
+    hardest = [{"start": "hanging"}] if "hanging" in known else []
+    return hardest + [{"start": "broad"}] * (_BROAD_STARTS + 1 - len(hardest))
+
+
+def _filmed(policies: dict[str, MPCPolicy], task: Env[Any, Any], start: Any, film: Path) -> Path:
+    from mpcoffline.plotting import animate
+
+    with messages.status("Film"):
+        return animate(policies, task, start, film, seconds=_FILM_SECONDS)

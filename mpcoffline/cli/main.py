@@ -1,0 +1,49 @@
+"""The command line ``mpcoffline``. Every command imports what it needs when it runs, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from . import datasets as cli_datasets
+from . import figures as cli_figures
+from . import learn as cli_learn
+from . import run as cli_run
+from . import tools as cli_tools
+from .common import ErrorGroup, console, progress_to_stderr
+
+app = typer.Typer(
+    cls=ErrorGroup,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Start with:\n\nmpcoffline run pendulum\n\nSomething wrong? Run:\n\nmpcoffline doctor",
+)
+
+
+def _version(show: bool) -> None:
+    if show:
+        from mpcoffline import __version__
+
+        console.print(f"mpcoffline {__version__}", highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Learn a Model Predictive Controller from logged data, without solving one MPC while learning.
+
+    The method: Sawant, Anand, Reinhardt, Gros, arXiv:2301.01667.
+    """
+    progress_to_stderr()
+
+
+for commands in (cli_run, cli_learn, cli_figures, cli_tools):
+    app.add_typer(commands.app)
+app.add_typer(cli_datasets.app, name="datasets")

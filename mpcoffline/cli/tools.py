@@ -1,0 +1,86 @@
+"""The commands ``mpcoffline export``, ``mpcoffline doctor`` and ``mpcoffline clean``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from .common import Controller, Json, examples, loaded_policy, print_json, say, say_file
+
+app = typer.Typer()
+
+_MARKS = {"ok": "[green]ok[/]  ", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
+
+
+@app.command(epilog=examples("mpcoffline export learner_policy.zip --out controller/"))
+def export(
+    policy: Controller,
+    out: Annotated[Path, typer.Option(help="Folder for the C files.", file_okay=False)] = Path("controller"),
+) -> None:
+    """Write a policy as self-contained C99: no allocation, no dependency, a fixed budget of iterations.
+
+    The folder receives the controller, a header with names and units of the parameters, a CMake file, and a test that
+    compares it with this package's solutions.
+    """
+    from mpcoffline.control.export import export_c
+
+    for path in export_c(loaded_policy(policy), out):
+        say_file("C", path)
+
+
+class Waste(StrEnum):
+    """What piles up, ``mpcoffline.datasets.check.cleaning.KINDS_OF_WASTE``."""
+
+    leftovers = "leftovers"
+    caches = "caches"
+    downloads = "downloads"
+    backups = "backups"
+
+
+@app.command(epilog=examples("mpcoffline clean", "mpcoffline clean --yes", "mpcoffline clean downloads backups"))
+def clean(
+    kinds: Annotated[
+        list[Waste] | None, typer.Argument(help="What to look for.", show_default="leftovers caches")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Remove it.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Say what can go and how much room it takes; with `--yes` remove it.
+
+    **leftovers**: what killed processes had half built. **caches**: compiled solvers and tables, which are made again
+    when needed. **downloads** that broke off, and **backups** of repaired data sets, only if named. Data sets, and
+    recordings that `mpcoffline datasets repair` can finish, are never touched.
+    """
+    from mpcoffline.datasets.check.cleaning import DEFAULT_KINDS
+    from mpcoffline.datasets.check.cleaning import clean as look
+
+    report = look([kind.value for kind in kinds] if kinds else DEFAULT_KINDS, remove_found=yes)
+    if as_json:
+        print_json({"found": [asdict(waste) | {"path": str(waste.path)} for waste in report.found]})
+        return
+    say(escape(str(report)))
+    if report.found and not yes:
+        say(f"{report.size / 1e6:.1f} MB in all. Nothing was removed; to remove it, add --yes.")
+
+
+@app.command(epilog=examples("mpcoffline doctor", "mpcoffline doctor --json > doctor.json"))
+def doctor(as_json: Json = False) -> None:
+    """Check this installation: versions, C compiler, cache, solvers, data sets, GPU, threads. Put it into bug reports.
+
+    Exit code 1 if something that is needed is broken.
+    """
+    from .doctor import diagnosis
+
+    found = diagnosis()
+    if as_json:
+        print_json(found)
+    else:
+        for check in found["checks"]:
+            advice = f" -> {check['advice']}" if check["advice"] else ""
+            say(f"{_MARKS[check['status']]}  {check['name']}: {escape(check['found'] + advice)}")
+    raise typer.Exit(0 if found["ok"] else 1)

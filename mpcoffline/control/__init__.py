@@ -1,0 +1,7 @@
+"""An MPC at work: the policy, closed loops and what they cost, C for a microcontroller, other libraries' protocols."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

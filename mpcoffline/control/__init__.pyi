@@ -1,0 +1,6 @@
+"""What the package shows, and where it lives: the one list, which type checkers and the lazy loader both read."""
+
+from .evaluation import evaluate as evaluate
+from .export import export_c as export_c
+from .policy import MPCPolicy as MPCPolicy
+from .predictors import D3rlpyPredictor as D3rlpyPredictor

@@ -1,0 +1,363 @@
+"""MPCPolicy: an MPC wherever Stable-Baselines3 expects a policy."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from os import PathLike
+from typing import Any, Self, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, holds, plain, read_archive, write_archive
+from mpcoffline.core.checks import check_integers, check_number
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.mpc import MPC
+from mpcoffline.solvers import Plan, Solver, check_solver, make_solver
+from mpcoffline.solvers.fallback import Fallback, SolverStats
+from mpcoffline.solvers.options import OF_THE_MACHINE
+
+logger = logging.getLogger(__name__)
+
+
+class MPCPolicy(BasePolicy):
+    """The policy pi_theta(s) = u_0* of (MPC) with the interface of an SB3 policy.
+
+    ``predict`` solves one MPC an observation. The warm start travels in SB3's recurrent ``state``, so that nothing is
+    hidden in the policy: ``state=None`` is a cold, deterministic solve.
+
+    A solve that fails does not raise in the control loop. A problem that was only tried from its plan is solved again
+    from all starts; with ``rescue="ipopt"`` ipopt tries too; else the best plan found is applied, which is a rollout of
+    the model within the input bounds, or, if the previous plan violates hard constraints less or no plan is finite, the
+    next input of the previous one (zero, within bounds, if there is none either). ``solver_stats`` counts each of these
+    answers, and the first of each kind is logged.
+
+    The policy is also a plain function, ``policy(observations)``: actions alone, by cold solves.
+
+    With ``deterministic=False`` it explores, so that an MPC can collect data::
+
+        a = clip(u_0* + sigma (high - low) w, low, high),   w ~ N(0, I)
+
+    where ``low`` and ``high`` are the bounds of the action space and sigma is ``exploration_noise``. The plan that
+    travels in ``state`` is that of u_0*, without noise.
+
+    Args:
+        mpc: The MPC; its state is the environment's observation.
+        solver: Name of the solver, see :func:`mpcoffline.make_solver`.
+        observation_space: The environment's; unbounded by default.
+        action_space: The environment's; float32 with the MPC's input bounds by default.
+        exploration_noise: sigma, a fraction of the action range; SB3's customary ``NormalActionNoise`` of 0.1 in
+            actions scaled to [-1, 1] is 0.05 here.
+        seed: Seeds the noise; :meth:`set_random_seed` starts it anew.
+        rescue: ``"ipopt"`` has ipopt try what the solver failed to solve, hundreds of times slower; its program is
+            built at the first failure. None, the default, for no rescue. Exported C has none.
+        rescue_time: Time that ipopt may take for a problem, in s, the building aside.
+        **solver_options: Passed to the solver.
+
+    Attributes:
+        mpc: The MPC.
+        solver_stats: Counts since construction, of solves and of how failures were answered.
+
+    Raises:
+        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, a negative noise or seed, a
+            ``rescue_time`` that is not positive, or an option that the solver has not.
+        UnknownIdError: For an unknown solver or rescue.
+    """
+
+    def __init__(
+        self,
+        mpc: MPC,
+        solver: str = "auto",
+        *,
+        observation_space: spaces.Box | None = None,
+        action_space: spaces.Box | None = None,
+        exploration_noise: float = 0.1,
+        seed: int = 0,
+        rescue: str | None = None,
+        rescue_time: float = 1.0,
+        **solver_options: Any,
+    ) -> None:
+        if observation_space is None:
+            observation_space = spaces.Box(-np.inf, np.inf, (mpc.nx,), np.float32)
+        if action_space is None:
+            with np.errstate(over="ignore"):  # a bound beyond float32 is none
+                low, high = (np.asarray(bound, dtype=np.float32) for bound in (mpc.action_low, mpc.action_high))
+            action_space = spaces.Box(low, high, dtype=np.float32)
+        for name, space, size in (
+            ("observation_space", observation_space, mpc.nx),
+            ("action_space", action_space, mpc.nu),
+        ):
+            if not isinstance(space, spaces.Box) or space.shape != (size,):
+                raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
+        check_solver(solver, solver_options)
+        super().__init__(observation_space, action_space)
+        self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
+        self._fallback = Fallback(mpc, rescue, rescue_time)
+        self.exploration_noise = exploration_noise
+        self.set_random_seed(seed)
+        self._solver: Solver | None = None
+        self._vec_normalize: VecNormalize | None = None
+        self._clipping_reported = False
+
+    @property
+    def solver_stats(self) -> SolverStats:
+        """Counts since construction."""
+        return self._fallback.stats
+
+    @property
+    def exploration_noise(self) -> float:
+        """Standard deviation of the noise under ``deterministic=False``, a fraction of the action range.
+
+        Raises:
+            InvalidArgumentError: On setting a number that is negative or not finite.
+        """
+        return self._exploration_noise
+
+    @exploration_noise.setter
+    def exploration_noise(self, value: float) -> None:
+        check_number("exploration_noise", value, 0.0, open_low=False)
+        self._exploration_noise = float(value)
+
+    def set_random_seed(self, seed: int) -> None:
+        """Starts the exploration noise anew.
+
+        Args:
+            seed: The same seed gives the same noise.
+
+        Raises:
+            InvalidArgumentError: For a negative seed.
+        """
+        check_integers(0, seed=seed)
+        self._seed, self._noise_generator = int(seed), np.random.default_rng(seed)
+
+    def with_normalization(self, vec_env: VecEnv | None) -> Self:
+        """The policy for the observations that an environment under ``VecNormalize`` gives.
+
+        An MPC needs observations in their units, so each is un-normalised with the statistics that ``vec_env`` has at
+        that moment; normalised rewards do not matter. What ``VecNormalize`` clipped is lost: the MPC then sees the
+        clipped observation, and a warning is logged the first time. The statistics are not saved with the policy
+        (``VecNormalize.save`` does that).
+
+        Args:
+            vec_env: The environment that will be acted in; wrappers are looked through.
+
+        Returns:
+            A policy that shares everything else with this one; for an environment without ``VecNormalize``, or None,
+            one that takes observations as they are.
+        """
+        policy = copy.copy(self)
+        policy._solver = self._solver  # a copy alone would build its own
+        policy._noise_generator = copy.deepcopy(self._noise_generator)  # whose draws would otherwise be shared out
+        policy._vec_normalize = None if vec_env is None else unwrap_vec_normalize(vec_env)
+        return policy
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the solver, which is compiled code: a copy builds its own when first used."""
+        return self.__dict__ | {"_solver": None}
+
+    @property
+    def solver(self) -> Solver:
+        """The solver, built when first used."""
+        if self._solver is None:
+            self._solver = make_solver(self.mpc, self.solver_name, **self.solver_options)
+        return self._solver
+
+    def predict(
+        self,
+        observation: ArrayLike | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Plan]:
+        """The optimal first inputs, and the warm start for the next call.
+
+        Args:
+            observation: ``(nx,)``, or ``(B, nx)`` for B environments; dictionaries are refused.
+            state: What the previous call returned; None starts cold.
+            episode_start: ``(B,)`` booleans; environments that have just been reset start cold.
+            deterministic: Whether to act without exploration noise.
+
+        Returns:
+            Actions ``(nu,)`` or ``(B, nu)`` within the bounds and in the dtype of the action space, and the state: the
+            plan shifted by one step.
+
+        Raises:
+            InvalidArgumentError: For an observation of the wrong shape or with NaN, a state of another batch size, or
+                noise where actions are unbounded.
+        """
+        given = self._checked_observation(observation)
+        observations = np.atleast_2d(given)
+        if self._vec_normalize is not None:
+            observations = self._unnormalized(observations, self._vec_normalize)
+        warm_start = self._warm_start(state, episode_start, len(observations))
+        solution = self.solver.solve(observations, warm_start=warm_start)
+        inputs, plan = self._fallback.answer(self.solver, observations, warm_start, solution)
+        if not deterministic:
+            inputs = self._explored(inputs)
+        space = self._action_box
+        actions = np.clip(inputs.astype(space.dtype), space.low, space.high)
+        return (actions[0] if given.ndim == 1 else actions), plan
+
+    def forward(self, observation: ArrayLike | torch.Tensor, deterministic: bool = True) -> NDArray[Any] | torch.Tensor:
+        """Actions ``(B, nu)`` of observations ``(B, nx)``, or of one, by cold solves: what ``policy(y)`` returns.
+
+        A tensor gives a tensor, without gradients; anything else an array.
+        """
+        if isinstance(observation, torch.Tensor):
+            return self._predict(observation, deterministic)
+        return self.predict(observation, deterministic=deterministic)[0]
+
+    def _predict(self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = True) -> torch.Tensor:
+        if isinstance(observation, dict):
+            raise InvalidArgumentError("observation", expected="a tensor", actual="a dictionary")
+        actions, _ = self.predict(observation.detach().cpu().numpy(), deterministic=deterministic)
+        return torch.as_tensor(actions, device=observation.device)
+
+    @property
+    def _action_box(self) -> spaces.Box:
+        assert isinstance(self.action_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
+        return self.action_space
+
+    def _checked_observation(self, observation: ArrayLike | dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+        expected = f"shape ({self.mpc.nx},) or (B, {self.mpc.nx})"
+        try:
+            array = np.asarray(cast(ArrayLike, observation), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InvalidArgumentError(
+                "observation",
+                expected=f"an array of {expected}",
+                actual=f"{type(observation).__name__}: {error}",
+                hint="Gymnasium's reset() returns observation and info, a VecEnv's the observations alone.",
+            ) from error
+        if array.ndim not in (1, 2) or array.shape[-1] != self.mpc.nx or not array.size:
+            raise InvalidArgumentError(
+                "observation",
+                expected=expected,
+                actual=f"shape {array.shape}",
+                hint="Is the policy used in the environment that its MPC models?",
+            )
+        if not np.isfinite(array).all():
+            first = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+            raise InvalidArgumentError(
+                "observation", expected="finite numbers", actual=f"{array[first]} at index {list(first)} of {array}"
+            )
+        return array
+
+    def _unnormalized(self, observations: NDArray[np.float64], vec_env: VecNormalize) -> NDArray[np.float64]:
+        """Observations in their units."""
+        if not vec_env.norm_obs:
+            return observations
+        if not self._clipping_reported and (np.abs(observations) >= np.float32(vec_env.clip_obs)).any():
+            logger.warning("VecNormalize clipped an observation at %g: the MPC sees another state.", vec_env.clip_obs)
+            self._clipping_reported = True
+        return np.asarray(vec_env.unnormalize_obs(observations), dtype=np.float64)
+
+    def _explored(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Inputs with exploration noise, not yet clipped."""
+        width = self._action_box.high.astype(np.float64) - self._action_box.low
+        if not np.isfinite(width).all():
+            raise InvalidArgumentError(
+                "deterministic",
+                expected="True where an action is unbounded, since the noise is a fraction of its range",
+                actual=f"False in {self.action_space}",
+            )
+        return inputs + self.exploration_noise * width * self._noise_generator.standard_normal(inputs.shape)
+
+    def _warm_start(
+        self, state: tuple[NDArray[Any], ...] | None, episode_start: ArrayLike | None, n_problems: int
+    ) -> Plan:
+        """The plan to start from, without the rows whose episode has just begun."""
+        if state is None:
+            return Plan.none(n_problems, self.mpc)
+        if len(state) != 2:
+            raise InvalidArgumentError(
+                "state", expected="what predict returned: states and inputs", actual=f"{len(state)} arrays"
+            )
+        plan = Plan(*state)
+        if len(plan.u) != n_problems:
+            raise InvalidArgumentError(
+                "state", expected=f"the state of {n_problems} environments", actual=f"that of {len(plan.u)}"
+            )
+        if episode_start is None:
+            return plan
+        started = np.asarray(episode_start, dtype=bool)
+        if started.shape not in ((), (n_problems,)):
+            raise InvalidArgumentError(
+                "episode_start", expected=f"shape ({n_problems},)", actual=f"shape {started.shape}"
+            )
+        if not started.any():  # as at nearly every step
+            return plan
+        return plan.select(~np.broadcast_to(started, (n_problems,)))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed.
+
+        Of the solver's options, those that say how many cores are used (``n_threads``, ``n_workers``) are left out:
+        they are the machine's, not the controller's.
+        """
+        observation_space = self.observation_space
+        assert isinstance(observation_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
+        document = {
+            "mpc": self.mpc.to_json(),
+            "solver": self.solver_name,
+            "solver_options": plain({k: v for k, v in self.solver_options.items() if k not in OF_THE_MACHINE}),
+            "exploration_noise": self.exploration_noise,
+            "seed": self._seed,
+            "rescue": self._fallback.rescue,
+            "rescue_time": self._fallback.rescue_time,
+            "observation_space": box_to_json(observation_space),
+            "action_space": box_to_json(self._action_box),
+        }
+        write_archive(path, "policy", document)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], device: torch.device | str = "auto", **solver_options: Any) -> Self:
+        """Reads what :meth:`save` wrote; of a learner's file, the policy that it has learned.
+
+        Args:
+            path: The file of a policy or a learner.
+            device: Accepted for SB3; MPCs are solved on the CPU.
+            **solver_options: Options of the solver that go before the file's, e.g. ``n_threads=4``.
+
+        Raises:
+            FileFormatError: If the file is damaged, foreign or of another version.
+            InvalidArgumentError: For an option that the solver has not.
+            MPCOfflineError: For a learner that has not learned.
+        """
+        if holds(path, "learner"):
+            return cls._of_learner(path, solver_options)
+        document, _ = read_archive(path, "policy")
+        with file_errors(path):
+            options, solver = dict(document["solver_options"]), document["solver"]
+            if foreign := OF_THE_MACHINE & options.keys():
+                raise FileFormatError("solver_options", expected="none of the machine", actual=", ".join(foreign))
+            check_solver(solver, options)
+        check_solver(solver, options | solver_options)
+        with file_errors(path):
+            return cls(
+                MPC.from_json(document["mpc"]),
+                solver,
+                observation_space=box_from_json(document["observation_space"]),
+                action_space=box_from_json(document["action_space"]),
+                exploration_noise=document.get("exploration_noise", 0.1),
+                seed=document.get("seed", 0),
+                rescue=document.get("rescue"),
+                rescue_time=document.get("rescue_time", 1.0),
+                **(options | solver_options),
+            )
+
+    @classmethod
+    def _of_learner(cls, path: str | PathLike[str], solver_options: dict[str, Any]) -> Self:
+        document, _ = read_archive(path, "learner")
+        with file_errors(path):
+            learned, space = document["learned"], document["observation_space"]
+            mpc = None if learned is None else MPC.from_json(learned)
+            observation_space = None if space is None else box_from_json(space)
+        if mpc is None:
+            raise MPCOfflineError(str(path), expected="a learner that has learned", actual="one before its fit")
+        return cls(mpc, observation_space=observation_space, **solver_options)

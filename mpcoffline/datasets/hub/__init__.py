@@ -1,0 +1,1 @@
+"""Data sets elsewhere: downloads and uploads."""

@@ -1,0 +1,1 @@
+"""The packed table of transitions that learning reads."""

@@ -1,0 +1,17 @@
+"""What a log says of plant and measurement: model parameters, noise, smoothed states."""
+
+from __future__ import annotations
+
+from .identification import Identification, IdentificationConfig, identify
+from .smoothing import NoiseEstimate, estimate_noise, identify_smoothed, smooth, with_measurement_noise
+
+__all__ = [
+    "Identification",
+    "IdentificationConfig",
+    "NoiseEstimate",
+    "estimate_noise",
+    "identify",
+    "identify_smoothed",
+    "smooth",
+    "with_measurement_noise",
+]

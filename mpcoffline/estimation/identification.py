@@ -1,0 +1,375 @@
+"""The model parameters by least squares of the one-step prediction error: the baseline without any value function."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+import torch
+from numpy.typing import NDArray
+
+from mpcoffline.core.checks import check_integers, check_number
+from mpcoffline.core.errors import InvalidDataError
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.coordinates import Coordinates
+
+from .one_step import OneStep
+
+Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+FULL_TURN = 2.0 * np.pi
+_NEAR_TURN = 0.5  # rad
+_AT_BOUND = 1e-4  # in scaled coordinates
+_WEAKEST_PRIOR = 1e-10
+_NOT_FINITE = 1e3  # what a prediction that is not finite counts, in spreads of the increments
+_FEW_ROWS = 1_000  # for the way to the minimum
+_LARGEST = 1e150  # whose square is a float64
+_PRIOR_ROUNDS = 3  # until sigma^2, which begins at 1, is that of the minimum
+_MAX_ENTRIES = 20_000_000  # of the Jacobian: 160 MB
+
+
+@dataclass(frozen=True)
+class IdentificationConfig:
+    """How the model is identified.
+
+    Attributes:
+        rows: Transitions used; a random subset where there are more.
+        prior_spread: How far theta_0 may be off, as standard deviation in the scaled coordinates of
+            :class:`~mpcoffline.mpc.coordinates.Coordinates` (1: a factor e). It decides only what the data leave
+            open: its weight against the data is that of a Gaussian prior.
+        max_iterations: Bound on the iterations of a descent.
+        restarts: Further starting points, drawn from the prior, where the first one ends badly.
+    """
+
+    rows: int = 20_000
+    prior_spread: float = 1.0
+    max_iterations: int = 50
+    restarts: int = 4
+
+    def __post_init__(self) -> None:
+        check_number("prior_spread", self.prior_spread, 0.0)
+        check_integers(1, rows=self.rows, max_iterations=self.max_iterations)
+        check_integers(0, restarts=self.restarts)
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified model, and how far it can be trusted.
+
+    Errors are root mean squares of the one-step prediction error s+ - f(s,a), a coordinate divided by ``scale``, so
+    that 1 is as bad as predicting s+ = s + a constant.
+
+    Attributes:
+        theta: All parameters of the MPC, those of the model identified, ``(size,)``.
+        deviation: One standard deviation of each, given data and prior; 0 where not identified, ``(size,)``.
+        scale: Spread of the increments s+ - s, ``(nx,)``.
+        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``.
+        errors_after: The same at theta.
+        at_bound: Names of the parameters that ended at a bound.
+        undetermined: Parameters, or combinations of them, that the data do not determine; these stay near theta_0.
+        unwrapped: Coordinates that proved to be wrapped angles.
+    """
+
+    theta: Array
+    deviation: Array
+    scale: Array
+    errors_before: Array
+    errors_after: Array
+    at_bound: tuple[str, ...] = ()
+    undetermined: tuple[str, ...] = ()
+    unwrapped: tuple[int, ...] = ()
+
+    @property
+    def error_before(self) -> float:
+        """Root mean square over all coordinates at theta_0."""
+        return float(np.sqrt(np.mean(self.errors_before**2)))
+
+    @property
+    def error_after(self) -> float:
+        """The same at theta."""
+        return float(np.sqrt(np.mean(self.errors_after**2)))
+
+
+class Rows(NamedTuple):
+    """The transitions used, in float64."""
+
+    x: Array
+    u: Array
+    reached: Array
+
+
+class _Descent(NamedTuple):
+    """Where one starting point led."""
+
+    z: Array
+    cost: float
+
+
+class OneStepProblem:
+    """Normalised one-step prediction errors as a function of the scaled coordinates z of the model parameters.
+
+    ::
+
+        min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
+    """
+
+    def __init__(self, mpc: MPC, rows: Rows, centre: Array | float = 0.0) -> None:
+        self.coordinates = c = Coordinates(mpc, ("model",))
+        self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
+        self.free = np.flatnonzero(c.high > c.low)
+        self.low, self.high = c.low[self.free], c.high[self.free]
+        names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
+        self.names = [names[i] for i in self.free]
+        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
+
+    def on(self, rows: Rows) -> OneStepProblem:
+        """The same problem for other rows, in the same scale."""
+        other = copy.copy(self)
+        other.rows = rows
+        return other
+
+    def theta(self, z: Array) -> Array:
+        """The full theta of free coordinates z."""
+        full = np.zeros(self.coordinates.size)
+        full[self.free] = z
+        return np.asarray(self.coordinates.theta(torch.from_numpy(full)).numpy())
+
+    def z(self, theta: Array) -> Array:
+        """The inverse of :meth:`theta`."""
+        return np.asarray(np.clip(self.coordinates.z(theta)[self.free], self.low, self.high))
+
+    def slopes(self, z: Array) -> Array:
+        """The derivative of theta in z, of the free coordinates."""
+        c = self.coordinates
+        slopes = np.where(c.logarithmic, self.theta(z)[c.mask], c.scale)
+        return np.asarray(slopes[self.free])
+
+    def errors(self, theta: Array) -> Array:
+        """Normalised prediction errors, ``(n, nx)``; not finite where the model is not."""
+        predicted = self.model.predict(self.rows.x, self.rows.u, theta)
+        return (predicted - self.rows.reached) / self.scale
+
+    def linearised(self, z: Array) -> tuple[Array, Array]:
+        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall."""
+        predicted, slopes = self.model.with_slopes(self.rows.x, self.rows.u, self.theta(z))
+        errors = (predicted - self.rows.reached) / self.scale
+        jacobian = slopes[:, :, self.free] * self.slopes(z) / self.scale[:, None]
+        finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
+        return np.where(finite, errors, _NOT_FINITE), np.where(finite[:, :, None], jacobian, 0.0)
+
+    def descend(self, start: Array, prior: float, max_iterations: int) -> _Descent:
+        """Trust-region Gauss-Newton from one start, within the bounds (scipy's ``trf``)."""
+        n, weight = self.rows.x.shape[0], np.sqrt(prior)
+        slopes: dict[bytes, Array] = {}  # of the last point, which trf asks for after its errors
+
+        def residuals(z: Array) -> Array:
+            errors, jacobian = self.linearised(z)
+            slopes.clear()
+            slopes[z.tobytes()] = np.concatenate([jacobian.reshape(-1, len(z)) / np.sqrt(n), weight * np.eye(len(z))])
+            return np.concatenate([errors.ravel() / np.sqrt(n), weight * z])
+
+        def derivative(z: Array) -> Array:
+            if z.tobytes() not in slopes:
+                residuals(z)
+            return slopes[z.tobytes()]
+
+        try:
+            found = scipy.optimize.least_squares(
+                residuals,
+                np.clip(start, self.low, self.high),
+                jac=derivative,
+                bounds=(self.low, self.high),
+                max_nfev=max_iterations,
+                xtol=1e-10,
+                ftol=1e-12,
+                gtol=1e-12,
+            )
+        except (ValueError, np.linalg.LinAlgError) as error:  # squares of the derivative overflow
+            raise InvalidDataError(
+                "identification",
+                expected="data on which the model's prediction has finite derivatives",
+                actual=f"states up to {np.abs(self.rows.x).max():g} ({error})",
+                hint="Are the data in the model's units?",
+            ) from error
+        return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
+
+
+def identify(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+) -> Identification:
+    """Identifies the model by least squares of the one-step prediction error.
+
+    ::
+
+        th* = argmin  E_D[ |(s+ - f_th(s,a)) / scale|^2 ] + (sigma^2 / n) |z / spread|^2
+
+    with scale the spread of the increments s+ - s of each coordinate, z the scaled coordinates of the model parameters
+    and sigma^2 the mean square error that remains: the maximum a posteriori estimate, whose prior decides only what
+    the data leave open (a mass and a gear that matter by their ratio alone). Such combinations are named in a warning.
+    An entry of s that the data wrap, as an angle, is compared modulo 2 pi.
+
+    Args:
+        mpc: The MPC; its parameters are theta_0, and all but those of the model stay as they are.
+        table: The transitions.
+        config: Prior, size and effort.
+        seed: Seeds the choice of rows and the restarts.
+
+    Returns:
+        The identified parameters with their errors; theta_0 itself for a model without parameters.
+
+    Raises:
+        InvalidDataError: If the data have other dimensions than the MPC.
+    """
+    config = config or IdentificationConfig()
+    table.check_fits(mpc.nx, mpc.nu)
+    rng = np.random.default_rng(seed)
+    centre = table.centring.centre[: table.ny]
+    problem = OneStepProblem(mpc, _rows(mpc, table, config, rng), centre)
+    rows, unwrapped = without_jumps(problem.rows, problem.errors(mpc.theta) * problem.scale)
+    if unwrapped:
+        problem = OneStepProblem(mpc, rows, centre)
+    if not problem.free.size:
+        return described(mpc, problem, np.zeros(0), np.zeros((0, 0)), config.prior_spread, unwrapped)
+    z, prior = _best_descent(problem, config, rng)
+    jacobian = problem.linearised(z)[1].reshape(-1, len(z))
+    information = jacobian.T @ jacobian / len(problem.rows.x) / (prior * config.prior_spread**2)
+    return described(mpc, problem, z, information, config.prior_spread, unwrapped)
+
+
+def described(
+    mpc: MPC, problem: OneStepProblem, z: Array, information: Array, spread: float, unwrapped: tuple[int, ...] = ()
+) -> Identification:
+    """What was identified, with errors on the problem's rows; warns of what the user should know.
+
+    Args:
+        mpc: The MPC; its parameters are theta_0.
+        problem: The one-step prediction problem.
+        z: The identified coordinates.
+        information: The data's information about z (the inverse of their covariance without the prior), ``(p, p)``.
+        spread: Standard deviation of the prior.
+        unwrapped: Coordinates that are wrapped angles.
+    """
+    theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
+    covariance, undetermined = _uncertainty(information, spread, problem.names)
+    deviation = np.zeros_like(theta)
+    identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
+    deviation[identified] = np.sqrt(np.diag(covariance)) * np.abs(problem.slopes(z))
+    result = Identification(
+        theta,
+        deviation,
+        problem.scale,
+        _root_mean_square(problem.errors(mpc.theta)),
+        _root_mean_square(problem.errors(theta)),
+        tuple(name for name, bound in zip(problem.names, _at_bound(problem, z), strict=True) if bound),
+        undetermined,
+        unwrapped,
+    )
+    _warn(result)
+    return result
+
+
+def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> Array:
+    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1.
+
+    Args:
+        x: States, ``(n, nx)``.
+        reached: Those after them, ``(n, nx)``.
+        centre: What the table that they are from was packed without, ``(nx,)``: it was not rounded to float32.
+    """
+    spread = (reached - x).std(axis=0)
+    rounding, least = (1e-6 * np.abs(x - offset).max(axis=0) for offset in (centre, 0.0))
+    return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
+
+
+def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Rows:
+    """A random subset in float64, small enough for its Jacobian."""
+    n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
+    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
+    chosen = np.sort(rng.permutation(len(table))[:count])
+    columns = table.columns(table.rows[chosen])
+    parts = (columns.observations, columns.actions, columns.next_observations)
+    return Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
+
+
+def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
+    """The rows with full turns removed from s+ in wrapped angles, and which coordinates these are.
+
+    These are confined to one turn, and their prediction errors are either small or near a full turn.
+    """
+    turns = np.round(np.nan_to_num(errors) / FULL_TURN)
+    jumps = turns != 0.0
+    near = np.abs(errors - FULL_TURN * turns) < _NEAR_TURN
+    confined = np.ptp(np.concatenate([rows.x, rows.reached]), axis=0) <= 1.05 * FULL_TURN
+    count = jumps.sum(axis=0)
+    wrapped = confined & (count > 0) & ((jumps & near).sum(axis=0) >= 0.9 * count)
+    reached = rows.reached + np.where(wrapped & jumps, FULL_TURN * turns, 0.0)
+    return rows._replace(reached=reached), tuple(int(i) for i in np.flatnonzero(wrapped))
+
+
+def _best_descent(
+    problem: OneStepProblem, config: IdentificationConfig, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """The minimum and the weight of its prior: found on few rows, refined on all.
+
+    It starts again from elsewhere where the first start ends at a bound or explains nothing.
+    """
+    n, n_coordinates = problem.rows.x.shape
+    few = problem.on(Rows(*(part[:: max(1, n // _FEW_ROWS)] for part in problem.rows)))
+
+    def weight(mean_square: float) -> float:
+        """What a Gaussian prior weighs against the mean square error: sigma^2 / (n spread^2)."""
+        return float(max(_WEAKEST_PRIOR, mean_square / n_coordinates / n) / config.prior_spread**2)
+
+    start, best = np.zeros(len(problem.free)), _Descent(np.zeros(len(problem.free)), np.inf)
+    for _ in range(config.restarts + 1):
+        best = min(best, few.descend(start, weight(1.0), config.max_iterations), key=attrgetter("cost"))
+        if best.cost < n_coordinates and not _at_bound(problem, best.z).any():
+            break
+        start = 0.5 * config.prior_spread * rng.standard_normal(len(start))
+    for _ in range(_PRIOR_ROUNDS):
+        prior = weight(float(np.sum(few.linearised(best.z)[0] ** 2)) / len(few.rows.x))
+        best = few.descend(best.z, prior, config.max_iterations)
+    return problem.descend(best.z, prior, config.max_iterations).z, prior
+
+
+def _uncertainty(information: Array, spread: float, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
+    """Covariance of z, and the combinations that stay about as uncertain as the prior."""
+    strengths, directions = np.linalg.eigh(information)
+    known = np.where(strengths > 1e-12 * strengths.max(initial=0.0), strengths, 0.0) * spread**2
+    covariance = spread**2 * (directions / (known + 1.0)) @ directions.T
+    return covariance, tuple(_combination(direction, names) for direction in directions[:, known < 3.0].T)
+
+
+def _combination(direction: Array, names: Sequence[str]) -> str:
+    """A direction in words: the parameters that it moves together, largest first."""
+    order = np.argsort(-np.abs(direction), kind="stable")
+    involved = [names[i] for i in order if abs(direction[i]) > 0.3 * np.abs(direction).max()]
+    return " with ".join(involved[:4]) + (" and others" if len(involved) > 4 else "")
+
+
+def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
+    return np.asarray((z - problem.low < _AT_BOUND) | (problem.high - z < _AT_BOUND))
+
+
+def _root_mean_square(errors: Array) -> Array:
+    """Of each coordinate ``(nx,)``, whatever the model predicts."""
+    finite = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_LARGEST, neginf=-_LARGEST)
+    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_LARGEST, _LARGEST) ** 2, axis=0)))
+
+
+def _warn(result: Identification) -> None:
+    if result.undetermined:
+        logger.warning("The data do not determine %s; kept near the given values.", ", nor ".join(result.undetermined))
+    if result.at_bound:
+        logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", result.at_bound)
+    if result.unwrapped:
+        logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(result.unwrapped))

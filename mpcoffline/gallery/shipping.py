@@ -1,0 +1,46 @@
+"""Making the data sets that ship with the package: train, record, pack, describe, sign."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from mpcoffline.datasets.recipes import Recipe
+from mpcoffline.datasets.store.packed import pack
+
+from .cards import write_card
+from .collection import collect_with, score_agent
+
+
+def make_shipped(task: str, folder: Path, *, progress: bool = True) -> list[Path]:
+    """Makes the packed file, the card and the figures of a task, and brings ``SHA256SUMS`` up to date.
+
+    The recording itself goes into the local Minari store under the recipe's id, which must be free.
+
+    Args:
+        task: Name of the task.
+        folder: The catalogue's folder.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The files written.
+
+    Raises:
+        UnknownIdError: For an unknown task.
+        InvalidArgumentError: Where the store holds a data set of that id.
+    """
+    recipe = Recipe.load(task)
+    dataset, agent = collect_with(recipe, progress=progress)
+    scores = score_agent(agent, recipe.make_env())
+    packed = folder / f"{task}.h5"
+    pack(dataset, packed)
+    card = write_card(dataset, recipe, scores, folder)
+    return [packed, card, write_checksums(folder)]
+
+
+def write_checksums(folder: Path) -> Path:
+    """Writes the sha256 of every packed file of a folder, in the format of ``sha256sum``."""
+    sums = folder / "SHA256SUMS"
+    lines = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}\n" for file in sorted(folder.glob("*.h5"))]
+    sums.write_text("".join(lines), encoding="utf-8")
+    return sums

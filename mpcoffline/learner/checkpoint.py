@@ -1,0 +1,74 @@
+"""A fit on disk, so that what was interrupted can go on."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from mpcoffline.core.archive import file_errors, read_archive, write_archive
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.outputs import check_output
+from mpcoffline.core.text import check_name
+
+from .fitting import Fit
+
+History = list[tuple[int, dict[str, float]]]
+
+
+class Checkpoint:
+    """A file with the state of a fit at the end of an epoch.
+
+    Args:
+        path: Where.
+        identity: What decides the fit (data, MPC, configuration, seed), as one short text.
+
+    Raises:
+        StorageError: If nothing could be written there.
+    """
+
+    def __init__(self, path: str | PathLike[str], identity: str) -> None:
+        check_output(path)
+        self._path, self._identity = Path(path), identity
+
+    def resume(self, fit: Fit) -> History:
+        """Takes a fit to where the file says, if there is one; returns the history until then.
+
+        Raises:
+            InvalidArgumentError: If the file is of another fit; it stays as it is.
+            FileFormatError: If it is damaged.
+        """
+        if not self._path.exists():
+            return []
+        document, arrays = read_archive(self._path, "checkpoint")
+        with file_errors(self._path):
+            identity = str(document["identity"])
+            history = history_from_json(document["history"])
+        if identity != self._identity:
+            raise InvalidArgumentError(
+                "checkpoint",
+                expected="a checkpoint of the same data, MPC, options and seed",
+                actual=f"{self._path}, of another fit",
+                hint="Name another file, or delete this one.",
+            )
+        fit.restore(arrays)
+        return history
+
+    def write(self, fit: Fit, history: History) -> None:
+        """Replaces the file; an interruption leaves the old one."""
+        write_archive(self._path, "checkpoint", {"identity": self._identity, "history": history}, fit.to_arrays())
+
+
+def history_from_json(data: Any) -> History:
+    """A history as files hold it: ``[[epoch, {metric: number}], ...]``.
+
+    Raises:
+        FileFormatError: For something else.
+        TypeError: Likewise.
+        ValueError: Likewise.
+    """
+    history: History = []
+    for epoch, metrics in data:
+        numbers = {check_name("metric", name, error=FileFormatError): float(value) for name, value in metrics.items()}
+        history.append((int(epoch), numbers))
+    return history

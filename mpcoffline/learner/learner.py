@@ -1,0 +1,338 @@
+"""OfflineMPCLearner: the two regressions of arXiv:2301.01667 as one ``fit``, and the policy that they give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+
+from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.core.checks import check_integers, check_known
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.text import check_name
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.learning import FitResult, ValueFunction
+from mpcoffline.mpc import MPC
+
+from .checkpoint import Checkpoint, History, history_from_json
+from .fitting import Epoch, Fit
+from .presets import PRESETS, LearnerConfig
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+Learn = Literal["cost", "cost+model"]
+#: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
+Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
+#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
+#: ends the fit there.
+Callback = Callable[["OfflineMPCLearner", int, int], Any]
+
+_GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
+
+
+class OfflineMPCLearner:
+    r"""Learns the parameters of an MPC from logged transitions, without solving one MPC.
+
+    Two regressions on the data set D, with the stage cost L (= -reward), discount gamma and successor s+::
+
+        (VALUE)  phi* = argmin E_D[ (L(s,a) + gamma V_phi(s+) - V_phi(s))^2 ]
+        (FIT)    th*  = argmin E_D[ (L(s,a) + gamma V_phi(s+) - gamma V_phi(f_th(s,a)) - Lhat_th(s,a))^2 ]
+                               + l2 |th - th_0|^2
+
+    By Theorem 1 of Gros & Zanon (doi:10.1109/TAC.2019.2913768) an MPC whose stage cost is Q*(s,a) - gamma V*(f(s,a))
+    and whose terminal cost is V* gives the optimal policy even when its model f is wrong; (FIT) looks for that stage
+    cost, and all presets but ``"paper"`` take the terminal cost from V too.
+
+    Example:
+        >>> mpc = nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0)
+        >>> learner = OfflineMPCLearner(mpc, learn="cost+model", preset="paper", seed=0)
+        >>> history = learner.fit("mpcoffline/pendulum/ddpg-v0")
+        >>> action, state = learner.policy.predict(observation)
+
+    Args:
+        mpc: MPC_1: the nominal MPC. It is never changed.
+        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3).
+        preset: Name of a :class:`~mpcoffline.learner.LearnerConfig` in ``mpcoffline.learner.PRESETS``: ``"paper"`` is
+            the published recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon,
+            ``"best"`` the longest.
+        seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
+        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"`` or ``"auto"``; overrides the
+            preset.
+        value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
+        device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
+        **overrides: Any field of :class:`~mpcoffline.learner.LearnerConfig`, ``ValueConfig`` or ``FitConfig``, e.g.
+            ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; names that two have take a prefix (``value_n_steps``,
+            ``fit_n_steps``).
+
+    Raises:
+        UnknownIdError: For an unknown preset, value method or override.
+        InvalidArgumentError: For another ``learn``, or a value out of range.
+    """
+
+    def __init__(
+        self,
+        mpc: MPC,
+        learn: Learn = "cost+model",
+        preset: str = "default",
+        seed: int = 0,
+        *,
+        value: str | None = None,
+        value_function: ValueFunction | None = None,
+        device: str = "cpu",
+        **overrides: Any,
+    ) -> None:
+        if not isinstance(learn, str) or learn not in _GROUPS:
+            raise InvalidArgumentError("learn", expected="'cost' or 'cost+model'", actual=repr(learn))
+        check_known("preset", preset, PRESETS)
+        if value is not None:
+            overrides["method"] = value
+        check_integers(0, seed=seed)
+        if value_function is not None and value_function.ny != mpc.nx:
+            raise InvalidArgumentError(
+                "value_function", expected=f"a function of {mpc.nx} coordinates", actual=str(value_function.ny)
+            )
+        self.config = PRESETS[preset].replaced(overrides)
+        self.nominal_mpc, self.learn, self.preset, self.seed, self.device = mpc, learn, preset, int(seed), device
+        self._given_value_function = self.value_function = value_function
+        self.result: FitResult | None = None
+        self.history: History = []
+        self._mpc: MPC | Callable[[], MPC] | None = None  # while fitting, how to find it
+        self._observation_space: spaces.Box | None = None
+        self._policy: MPCPolicy | None = None
+
+    def __repr__(self) -> str:
+        """What it learns, how, and whether it has."""
+        state = "fitted" if self.result is not None else "not fitted"
+        return f"{type(self).__name__}(learn={self.learn!r}, preset={self.preset!r}, seed={self.seed}; {state})"
+
+    def fit(
+        self,
+        dataset: MinariDataset | TransitionTable | str,
+        *,
+        n_steps: int | None = None,
+        n_steps_per_epoch: int | None = None,
+        evaluators: Mapping[str, Evaluator] | None = None,
+        callbacks: Sequence[Callback] = (),
+        checkpoint: str | PathLike[str] | None = None,
+        show_progress: bool = True,
+    ) -> History:
+        """Learns V_phi, then theta.
+
+        Args:
+            dataset: A Minari data set, the id of one, or a table of transitions.
+            n_steps: Gradient steps of (VALUE), by far the longest part; the configuration's by default.
+            n_steps_per_epoch: Steps between entries of the history; 500 in (VALUE) and 100 in (FIT) by default.
+            evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
+                one of (FIT) on, when there is a policy: the one that would be handed out if the fit ended there.
+            callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch; one that returns
+                False, also numpy's or torch's, ends the fit. :mod:`mpcoffline.learner.loggers` has those that write CSV
+                files and TensorBoard events, :mod:`mpcoffline.sb3` one that runs SB3's.
+            checkpoint: A file that is written at the end of each epoch. Where it exists, the fit goes on from it and
+                ends with the theta that it would have had without interruption, bit for bit.
+            show_progress: Whether to draw a progress bar.
+
+        Returns:
+            ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
+            ``fit_loss``.
+
+        Raises:
+            InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
+            InvalidArgumentError: If the checkpoint is of another fit, the given V_phi of another discount, or
+                ``dataset`` something else.
+            UnknownIdError: For an unknown data set id.
+        """
+        for _ in self.fitter(
+            dataset,
+            n_steps=n_steps,
+            n_steps_per_epoch=n_steps_per_epoch,
+            evaluators=evaluators,
+            callbacks=callbacks,
+            checkpoint=checkpoint,
+            show_progress=show_progress,
+        ):
+            pass
+        return self.history
+
+    def fitter(
+        self,
+        dataset: MinariDataset | TransitionTable | str,
+        *,
+        n_steps: int | None = None,
+        n_steps_per_epoch: int | None = None,
+        evaluators: Mapping[str, Evaluator] | None = None,
+        callbacks: Sequence[Callback] = (),
+        checkpoint: str | PathLike[str] | None = None,
+        show_progress: bool = True,
+    ) -> Iterator[tuple[int, dict[str, float]]]:
+        """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
+        for name in evaluators or {}:
+            check_name("evaluator", name)
+        lengths: dict[str, int] = {}
+        if n_steps_per_epoch is not None:
+            check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
+            lengths = {"value_epoch": n_steps_per_epoch, "fit_epoch": n_steps_per_epoch}
+        config = self.config if n_steps is None else self.config.replaced({"value_n_steps": n_steps})
+        table, observation_space = self._table(dataset)
+        fit = Fit(
+            self.nominal_mpc,
+            _GROUPS[self.learn],
+            config,
+            table,
+            seed=self.seed,
+            device=self.device,
+            value_function=self._given_value_function,
+        )
+        saved = None if checkpoint is None else Checkpoint(checkpoint, fit.identity)
+        history: History = [] if saved is None else saved.resume(fit)
+        with _Progress(show_progress) as progress:
+            for epoch in fit.epochs(**lengths):
+                self.value_function, self.result = fit.value_function, fit.result
+                self._mpc, self._policy, self._observation_space = fit.learned, None, observation_space
+                metrics = dict(epoch.metrics)
+                if fit.learned is not None:
+                    metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
+                history.append((len(history) + 1, metrics))
+                self.history = history
+                if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
+                    saved.write(fit, history)
+                answers = [callback(self, len(history), epoch.total_step) for callback in callbacks]
+                progress.show(epoch)
+                yield history[-1]
+                if any(_asks_to_end(answer) for answer in answers):
+                    self._mpc = self._found()  # which lets go of the data
+                    return
+            self._mpc = self._found()
+
+    @property
+    def mpc(self) -> MPC:
+        """The learned MPC; a new object. While fitting, the one that would be handed out if the fit ended now.
+
+        Raises:
+            MPCOfflineError: Before ``fit``, and in it before the first epoch of (FIT).
+        """
+        found = self._found()
+        if found is None:
+            raise MPCOfflineError(
+                "learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset)."
+            )
+        return found
+
+    def _found(self) -> MPC | None:
+        """The MPC; while fitting, its cost and its terminal cost take some seconds, once an epoch."""
+        return self._mpc if isinstance(self._mpc, MPC) or self._mpc is None else self._mpc()
+
+    @property
+    def theta(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """The learned parameters, ``(mpc.space.size,)``."""
+        return self.mpc.theta
+
+    @property
+    def policy(self) -> MPCPolicy:
+        """The learned MPC as an SB3-compatible policy.
+
+        Raises:
+            MPCOfflineError: Before ``fit``.
+        """
+        if self._policy is None:
+            self._policy = MPCPolicy(self.mpc, observation_space=self._observation_space)
+        return self._policy
+
+    def _table(self, dataset: MinariDataset | TransitionTable | str) -> tuple[TransitionTable, spaces.Box | None]:
+        if isinstance(dataset, TransitionTable):
+            return dataset, None
+        if isinstance(dataset, str):
+            from mpcoffline.datasets import load_dataset
+
+            dataset = load_dataset(dataset)
+        table, space = TransitionTable.of(dataset), dataset.observation_space
+        return table, space if isinstance(space, spaces.Box) else None
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz."""
+        space = self._observation_space
+        document = {
+            "nominal": self.nominal_mpc.to_json(),
+            "learned": None if self._mpc is None else self.mpc.to_json(),
+            "learn": self.learn,
+            "preset": self.preset,
+            "value_given": self._given_value_function is not None,
+            "seed": self.seed,
+            "device": self.device,
+            "config": asdict(self.config),
+            "history": self.history,
+            "result": None if self.result is None else self.result.to_json(),
+            "observation_space": None if space is None else box_to_json(space),
+        }
+        arrays = {} if self.value_function is None else self.value_function.to_arrays()
+        write_archive(path, "learner", document, arrays)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> OfflineMPCLearner:
+        """Reads what :meth:`save` wrote.
+
+        Raises:
+            FileFormatError: If the file is damaged, foreign or of another version.
+        """
+        document, arrays = read_archive(path, "learner")
+        with file_errors(path):
+            nominal = MPC.from_json(document["nominal"])
+            learner = cls(nominal, document["learn"], document["preset"], document["seed"], device=document["device"])
+            learner.config = LearnerConfig.from_json(document["config"])
+            learner.history = history_from_json(document["history"])
+            if document["learned"] is not None:
+                learner._mpc = MPC.from_json(document["learned"])
+            if document["result"] is not None:
+                learner.result = FitResult.from_json(document["result"], learner.mpc.theta)
+            if document["observation_space"] is not None:
+                learner._observation_space = box_from_json(document["observation_space"])
+            if arrays:
+                learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
+                if document["value_given"]:
+                    learner._given_value_function = learner.value_function
+                if learner.value_function.ny != learner.nominal_mpc.nx:
+                    raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
+        return learner
+
+
+def _asks_to_end(answer: Any) -> bool:
+    """Whether a callback's answer ends the fit: one that is false. None is no answer, nor are many of them at once."""
+    try:
+        return answer is not None and not answer
+    except (ValueError, RuntimeError):  # numpy's and torch's arrays of several
+        return False
+
+
+class _Progress:
+    """A progress bar over the phases of a fit."""
+
+    def __init__(self, show: bool) -> None:
+        from rich.progress import Progress
+
+        self._bar = Progress(disable=not show, transient=False)
+        self._tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if not self._bar.disable:  # rich before 14.3 prints an empty line even so
+            self._bar.stop()
+
+    def show(self, epoch: Epoch) -> None:
+        """Moves the bar of the epoch's phase."""
+        if epoch.phase not in self._tasks:
+            self._tasks[epoch.phase] = self._bar.add_task(epoch.phase)
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
+        self._bar.update(
+            self._tasks[epoch.phase],
+            completed=epoch.step,
+            total=epoch.n_steps,
+            description=f"{epoch.phase}: {shown}",
+        )

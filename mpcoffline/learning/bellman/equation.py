@@ -1,0 +1,115 @@
+"""The regression error of (FIT) and of the one-step prediction, as torch expressions of theta."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mpcoffline.datasets.table.transitions import Columns
+from mpcoffline.estimation.identification import FULL_TURN, Rows, without_jumps
+from mpcoffline.learning.value.fit import ValueFunction
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.torch_twin import TorchTwin
+
+
+def variance_of(costs: NDArray[np.floating[Any]]) -> float:
+    """The variance of logged costs ``(n,)``, the unit of the regression error; of one cost only, its square, or 1."""
+    if np.ptp(costs) == 0.0:
+        return float(costs[0]) ** 2 or 1.0
+    return float(costs.var(dtype=np.float64)) or 1.0
+
+
+class BellmanFit:
+    """The regression error of (FIT), arXiv:2301.01667.
+
+    ::
+
+        E_D[ (L(s,a) + gamma V(s+) - gamma V(f_th(s,a)) - Lhat_th(s,a))^2 ] / Var_D[L]
+
+    After a terminal state both V vanish.
+
+    Args:
+        mpc: The MPC whose functions f and Lhat are fitted.
+        value: V_phi, constant here.
+        unit: The variance that the error is divided by.
+    """
+
+    def __init__(self, mpc: MPC, value: ValueFunction, unit: float) -> None:
+        self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
+        self._value, self._discount, self.unit = value, mpc.discount, unit
+
+    def discounted(self, batch: Columns) -> Tensor:
+        """The weight of what follows, ``(B,)``: gamma, and zero after a terminal state."""
+        weight: Tensor = self._discount * (1.0 - batch.terminations.double())
+        return weight
+
+    def target(self, batch: Columns) -> Tensor:
+        """L(s,a) + gamma V(s+), ``(B,)``: what does not depend on theta."""
+        following = self._value(batch.next_observations).double()
+        target: Tensor = batch.costs.double() + self.discounted(batch) * following
+        return target
+
+    def predicted(self, batch: Columns, theta: Tensor) -> Tensor:
+        """The predicted successor f_th(s,a), ``(B, ny)``."""
+        reached: Tensor = self._f(batch.observations.double(), batch.actions.double(), theta)
+        return reached
+
+    def predicted_value(self, batch: Columns, theta: Tensor) -> Tensor:
+        """The discounted value of the predicted successor, gamma V(f_th(s,a)), ``(B,)``."""
+        value: Tensor = self.discounted(batch) * self._value(self.predicted(batch, theta)).double()
+        return value
+
+    def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:
+        """Lhat_th(s,a), ``(B,)``."""
+        cost: Tensor = self._stage(batch.observations.double(), batch.actions.double(), theta)
+        return cost.squeeze(-1)
+
+    def error(self, batch: Columns, theta: Tensor) -> Tensor:
+        """The mean squared error over a minibatch, a scalar."""
+        explained = self.predicted_value(batch, theta) + self.stage_cost(batch, theta)
+        return self.mean_square(self.target(batch) - explained)
+
+    def mean_square(self, residuals: Tensor) -> Tensor:
+        """The mean square of residuals in units of the cost's variance."""
+        return residuals.square().mean() / self.unit
+
+
+class PredictionError:
+    """The one-step prediction error, every coordinate in the spread of its increments.
+
+    ::
+
+        E_D[ mean_i ((s+_i - f_th(s,a)_i) / std_D[s+_i - s_i])^2 ]
+
+    Zero for the true model of a deterministic plant, about one for a model that predicts no motion. Full turns of
+    angles that are confined to one turn do not count.
+
+    Args:
+        problem: Has the model.
+        sample: Transitions that decide the spread, and which coordinates are such angles.
+        theta: Parameters with which the model predicts well enough to see jumps of a full turn.
+    """
+
+    def __init__(self, problem: BellmanFit, sample: Columns, theta: Tensor) -> None:
+        self._problem = problem
+        s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
+        with torch.no_grad():
+            missed = reached - problem.predicted(sample, theta)
+        rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
+        spread = (torch.from_numpy(rows.reached) - s).std(dim=0, correction=0)
+        self._scale = torch.where(spread > 0.0, spread, 1.0)
+
+    def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
+        """The mean error over a minibatch, a scalar."""
+        missed = batch.next_observations.double() - self._problem.predicted(batch, theta)
+        if self._angles:
+            turns = torch.zeros_like(missed)
+            angles = list(self._angles)
+            turns[:, angles] = FULL_TURN * torch.round(missed.detach()[:, angles] / FULL_TURN)
+            missed = missed - turns
+        error: Tensor = (missed / self._scale).square().mean()
+        return error

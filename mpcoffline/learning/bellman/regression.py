@@ -1,0 +1,326 @@
+"""(FIT): the parameters of the MPC by regression on the data; no MPC is solved (arXiv:2301.01667)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mpcoffline.core.checks import check_integers, check_number
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.learning.progress import Metrics, Report, silent
+from mpcoffline.learning.value.fit import ValueFunction, cosine
+from mpcoffline.learning.value.network import same_shape, whole_numbers
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.coordinates import Coordinates, canonical
+
+from .equation import BellmanFit, PredictionError, variance_of
+from .potential import Potential
+from .refit import refit_cost
+
+Array = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # Adam's state; it does not count steps that were skipped
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How theta is learned.
+
+    Attributes:
+        prior: l2, the weight of ``|z - z_0|^2``, where z are the scaled coordinates of
+            :class:`~mpcoffline.mpc.coordinates.Coordinates` and the regression error is measured in units of the
+            cost's variance.
+        prediction_weight: Weight of the one-step prediction error
+            (:class:`~mpcoffline.learning.bellman.PredictionError`) beside (FIT); 0 is the published method.
+        potential: Whether the cost is fitted with a :class:`~mpcoffline.learning.bellman.potential.Potential` besides.
+        n_steps: Gradient steps on cost and model together; none where the model is not learned.
+        batch_size: Transitions a step.
+        learning_rate: Adam's at the start, in scaled coordinates; falls to zero on a cosine.
+        clip: Bound on the gradient's norm.
+        n_restarts: How often the gradient steps may begin again, from a perturbed start with half the learning rate,
+            after they ended worse than they began.
+        refit_rows: Transitions of the full-batch fit of the cost; a random subset where there are more.
+        refit_iterations: Bound on its L-BFGS iterations.
+    """
+
+    prior: float = 1e-3
+    prediction_weight: float = 0.0
+    potential: bool = False
+    n_steps: int = 1_000
+    batch_size: int = 512
+    learning_rate: float = 0.03
+    clip: float = 100.0
+    n_restarts: int = 2
+    refit_rows: int = 20_000
+    refit_iterations: int = 300
+
+    def __post_init__(self) -> None:
+        for name in ("prior", "prediction_weight"):
+            check_number(name, getattr(self, name), 0.0, open_low=False)
+        for name in ("learning_rate", "clip"):
+            check_number(name, getattr(self, name), 0.0)
+        check_integers(0, n_steps=self.n_steps, n_restarts=self.n_restarts)
+        check_integers(1, **{n: getattr(self, n) for n in ("batch_size", "refit_rows", "refit_iterations")})
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What (FIT) found.
+
+    Attributes:
+        theta: The learned parameters, ``(size,)``.
+        loss_before: The regression error of (FIT) where it began, in units of the cost's variance.
+        loss_after: The same at theta.
+        at_bounds: Names of the learned parameters that ended on a bound.
+        potential: The potential that was fitted with the cost, if one was.
+    """
+
+    theta: Array
+    loss_before: float
+    loss_after: float
+    at_bounds: tuple[str, ...] = ()
+    potential: Potential | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description, without theta."""
+        return {
+            "loss_before": self.loss_before,
+            "loss_after": self.loss_after,
+            "at_bounds": list(self.at_bounds),
+            "potential": None if self.potential is None else self.potential.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], theta: Array) -> FitResult:
+        """The inverse of :meth:`to_json`."""
+        potential = None if data["potential"] is None else Potential.from_json(data["potential"])
+        at_bounds = tuple(map(str, data["at_bounds"]))
+        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential)
+
+
+class ParameterTraining:
+    """The state of (FIT) between its steps: Adam on cost and model together, then the convex fit of the cost.
+
+    The second part, :meth:`finish`, minimises the same objective over the cost alone, where it is a linear
+    least-squares problem in the weights; it takes the minimum that stochastic gradients only approach. Where the model
+    is not learned, it is all.
+
+    Args:
+        mpc: The MPC; its parameters are theta_0.
+        value: V_phi.
+        table: The transitions.
+        groups: ``("cost",)`` for MPC_2, ``("cost", "model")`` for MPC_3.
+        config: Prior and schedules.
+        seed: Seeds the minibatches.
+
+    Raises:
+        InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
+    """
+
+    def __init__(
+        self,
+        mpc: MPC,
+        value: ValueFunction,
+        table: TransitionTable,
+        groups: tuple[str, ...],
+        config: FitConfig,
+        *,
+        seed: int,
+    ) -> None:
+        self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
+        costs = table.costs
+        if len(costs) > 1 and np.ptp(costs) == 0.0:
+            _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
+        self._rng = np.random.default_rng(seed)
+        self._problem = BellmanFit(mpc, value, variance_of(costs))
+        rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
+        self._sample = table.columns(torch.from_numpy(table.rows[rows]))
+        self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))
+        self._coordinates = Coordinates(mpc, groups)
+        with torch.no_grad():
+            self._loss_before = float(self._problem.error(self._sample, torch.from_numpy(mpc.theta)))
+        if not np.isfinite(self._loss_before):
+            raise InvalidArgumentError(
+                "mpc",
+                expected="a model and a cost that are finite on the data",
+                actual=f"a regression error of {self._loss_before}",
+                hint="Evaluate mpc.dynamics_function and mpc.stage_function at the logged states and actions.",
+            )
+        self._low, self._high = (torch.from_numpy(b) for b in (self._coordinates.low, self._coordinates.high))
+        self._batches = table.batches(config.batch_size, self._rng)
+        self.n_steps = config.n_steps if "model" in groups else 0
+        self.attempt = self.step = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """The start of an attempt: the first from theta_0, others a little beside it and with shorter steps."""
+        start = self._coordinates.start
+        if self.attempt:
+            start = start + 0.1 * np.random.default_rng([self._seed, self.attempt]).normal(size=start.shape)
+        z = torch.from_numpy(start)
+        self._z = torch.minimum(torch.maximum(z, self._low), self._high).requires_grad_()
+        self._optimiser = torch.optim.Adam([self._z], lr=self.config.learning_rate)
+
+    @property
+    def theta(self) -> Array:
+        """The parameters reached so far, ``(size,)``."""
+        return canonical(self._mpc, self._coordinates.theta(self._z.detach()).numpy())
+
+    @property
+    def done(self) -> bool:
+        """Whether all gradient steps are made."""
+        return self.step >= self.n_steps
+
+    def advance(self, n: int) -> Metrics:
+        """Makes n more gradient steps, fewer at the end of an attempt; returns their mean regression error."""
+        losses: list[float] = []
+        made = min(n, self.n_steps - self.step)
+        for _ in range(made):
+            self.step += 1
+            losses += self._gradient_step()
+        if made and not losses:
+            _log.warning("(FIT) did not move in %d steps: no gradient was finite; has the model a sqrt at zero?", made)
+        if self.done and self._failed() and self.attempt < self.config.n_restarts:
+            self.attempt, self.step = self.attempt + 1, 0
+            _log.warning(
+                "(FIT) ended worse than it began; starting again beside theta_0 (%d of at most %d restarts)",
+                self.attempt,
+                self.config.n_restarts,
+            )
+            self._begin()
+        return {"fit_loss": float(np.mean(losses)) if losses else np.nan}
+
+    def _gradient_step(self) -> list[float]:
+        """One step of Adam, projected onto the bounds; returns the regression error where it was finite."""
+        config = self.config
+        schedule = cosine(self.step, self.n_steps) * 0.5**self.attempt
+        self._optimiser.param_groups[0]["lr"] = config.learning_rate * schedule
+        batch, theta = self._table.columns(next(self._batches)), self._coordinates.theta(self._z)
+        error = self._problem.error(batch, theta)
+        loss = error + config.prior * self._z.square().sum()
+        if config.prediction_weight > 0.0:
+            loss = loss + config.prediction_weight * self._prediction_error(batch, theta)
+        self._optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_([self._z], config.clip)
+        if not torch.isfinite(norm):  # one NaN would stay in Adam's moments for ever
+            return []
+        self._optimiser.step()
+        with torch.no_grad():
+            self._z.clamp_(self._low, self._high)
+        return [float(error.detach())]
+
+    def _failed(self) -> bool:
+        """Whether the gradient steps ended with a larger objective than they began with."""
+        with torch.no_grad():
+            before, after = (
+                self._objective(self._coordinates.theta(z)) for z in (torch.zeros_like(self._z), self._z.detach())
+            )
+        travelled = self.config.prior * float(self._z.detach().square().sum())
+        return not after + travelled <= before * (1.0 + 1e-3)
+
+    def _objective(self, theta: torch.Tensor) -> float:
+        error = self._problem.error(self._sample, theta)
+        return float(error + self.config.prediction_weight * self._prediction_error(self._sample, theta))
+
+    def finish(self) -> FitResult:
+        """The convex fit of the cost from where the gradient steps ended; theta_0's model where they all failed."""
+        theta = self._mpc.theta
+        if self.n_steps and not self._failed():
+            theta = self.theta
+        elif self.n_steps:
+            _log.warning("(FIT) of cost and model failed in every attempt; the model stays as it was")
+        config = self.config
+        refit = refit_cost(
+            self._mpc,
+            theta,
+            self._problem,
+            self._sample,
+            prior=config.prior,
+            shaped=config.potential,
+            max_iterations=config.refit_iterations,
+        )
+        at_bounds = tuple(self._coordinates.at_bounds(refit.theta))
+        if at_bounds:
+            _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", ", ".join(at_bounds))
+        return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """What :meth:`restore` needs to go on bit for bit."""
+        arrays = {"z": self._z.detach().numpy().copy(), "steps": np.array([self.attempt, self.step], dtype=np.float64)}
+        moments = self._optimiser.state[self._z]
+        return arrays | {name: moments[name].numpy().copy() for name in _MOMENTS if moments}
+
+    def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
+        """Takes over a state from :meth:`to_arrays` of a training with the same arguments.
+
+        Raises:
+            FileFormatError: If arrays are missing or of another problem.
+        """
+        try:
+            attempt, step = whole_numbers(arrays["steps"], 2)
+            if not (0 <= attempt <= self.config.n_restarts and 0 <= step <= self.n_steps):
+                raise ValueError(f"attempt {attempt}, step {step}")
+            z = same_shape(arrays["z"], self._z)
+            kinds = {"step": torch.zeros(())} | dict.fromkeys(_MOMENTS[1:], self._z) if "exp_avg" in arrays else {}
+            moments = {name: same_shape(arrays[name], kind) for name, kind in kinds.items()}
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(
+                "state of (FIT)", expected="that of the same MPC and configuration", actual=str(error)
+            ) from error
+        self.attempt, self.step = attempt, step
+        for _ in range(attempt * self.n_steps + step):
+            next(self._batches)
+        self._begin()
+        with torch.no_grad():
+            self._z.copy_(z)
+        if moments:
+            self._optimiser.state[self._z] = moments
+
+
+def fit_parameters(
+    mpc: MPC,
+    value: ValueFunction,
+    table: TransitionTable,
+    groups: tuple[str, ...],
+    config: FitConfig,
+    *,
+    seed: int,
+    epoch: int = 100,
+    report: Report = silent,
+) -> FitResult:
+    """Learns theta by (FIT): a :class:`ParameterTraining` from beginning to end.
+
+    Args:
+        mpc: The MPC; its parameters are theta_0.
+        value: V_phi.
+        table: The transitions.
+        groups: ``("cost",)`` for MPC_2, ``("cost", "model")`` for MPC_3.
+        config: Prior and schedules.
+        seed: Seeds the minibatches.
+        epoch: Steps between reports.
+        report: Called with ``{"fit_loss": ...}``.
+
+    Returns:
+        The parameters and the errors before and after.
+
+    Raises:
+        InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
+    """
+    training = ParameterTraining(mpc, value, table, groups, config, seed=seed)
+    total = training.n_steps + 1
+    while not training.done:
+        metrics = training.advance(epoch)
+        report(training.step, total, metrics)
+    result = training.finish()
+    report(total, total, {"fit_loss": result.loss_after})
+    return result

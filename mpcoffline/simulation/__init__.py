@@ -1,0 +1,1 @@
+"""Models of a log, and closed loops on them."""

@@ -1,0 +1,102 @@
+"""Closed loops on all members of an ensemble at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.datasets.table.transitions import TransitionTable
+
+from .ensemble import Ensemble
+from .logged_cost import LoggedCost
+
+Array = NDArray[np.float64]
+
+_RUN_AWAY = 30.0  # spreads of the data: a state this far out has left what any model of them knows
+_END = 0.1  # share of the steps at the end by which success is judged
+_SETTLED = 0.1  # of the log's mean cost above its cheapest
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A controller in closed loop with every member of the ensemble from every start.
+
+    Attributes:
+        cost: Undiscounted cost of each episode above the cheapest logged cost, ``(members, starts)``.
+        success: Whether the mean cost of the last tenth of the steps was small, ``(members, starts)``.
+        lost: Whether the state ran away, ``(members, starts)``.
+        states: States with the identified model, ``(starts, T + 1, nx)``.
+        actions: Inputs with the identified model, ``(starts, T, nu)``.
+    """
+
+    cost: Array
+    success: NDArray[np.bool_]
+    lost: NDArray[np.bool_]
+    states: Array
+    actions: Array
+
+    @property
+    def mean_cost(self) -> Array:
+        """Mean over the starts, ``(members,)``."""
+        return np.asarray(self.cost.mean(axis=1))
+
+
+def simulate(
+    policy: MPCPolicy, ensemble: Ensemble, cost: LoggedCost, table: TransitionTable, starts: Array, n_steps: int
+) -> Simulation:
+    """Runs a controller on all members from all starts; all MPCs of a step are solved in one batch.
+
+    A state that runs away (30 spreads of the data) stays where it was and costs as much as the dearest logged
+    transition from then on.
+
+    Args:
+        policy: The controller.
+        ensemble: The models.
+        cost: The stage cost.
+        table: The data, for scales.
+        starts: ``(starts, nx)``.
+        n_steps: Length of an episode.
+    """
+    columns = table.values()
+    middle, spread = columns.observations.mean(axis=0), columns.observations.std(axis=0)
+    reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread
+    reach = np.where(spread > 0.0, reach, np.inf)
+    dearest = float(columns.costs.max())
+    n, (s, nx) = len(ensemble), starts.shape
+    x = np.broadcast_to(starts, (n, s, nx)).copy()
+    lost = np.zeros((n, s), dtype=bool)
+    costs, states, actions, plan = [], [x[0].copy()], [], None
+    for _ in range(n_steps):
+        flat = x.reshape(-1, nx)
+        u, plan = policy.predict(flat, state=plan)
+        u = np.asarray(u, dtype=np.float64)
+        stage = cost(flat, u).reshape(n, s)
+        costs.append(np.where(lost, dearest, stage) - cost.low)
+        reached = ensemble.step(x, u.reshape(n, s, -1))
+        lost |= ~(np.abs(reached - middle) < reach).all(axis=2)
+        x = np.where(lost[:, :, None], x, reached)
+        states.append(x[0].copy())
+        actions.append(u.reshape(n, s, -1)[0])
+    each = np.stack(costs, axis=2)
+    end = max(1, round(_END * n_steps))
+    small = _SETTLED * (float(columns.costs.mean()) - cost.low)
+    return Simulation(
+        each.sum(axis=2),
+        (each[:, :, -end:].mean(axis=2) <= small) & ~lost,
+        lost,
+        np.stack(states, axis=1),
+        np.stack(actions, axis=1),
+    )
+
+
+def initial_states(table: TransitionTable, count: int, seed: int) -> Array:
+    """Where the log's own episodes began, at random; further states of the log where there are too few episodes."""
+    rng = np.random.default_rng(seed)
+    _, firsts = np.unique(table.episode_ids, return_index=True)
+    chosen = rng.permutation(firsts)[:count]
+    if len(chosen) < count:
+        chosen = np.concatenate([chosen, rng.integers(len(table), size=count - len(chosen))])
+    return np.asarray(table.take(np.sort(chosen)).observations, dtype=np.float64)

@@ -1,0 +1,1 @@
+"""IPOPT through CasADi: slow, and takes any smooth problem."""

@@ -1,0 +1,172 @@
+"""The exported C: it compiles without a warning, needs nothing, and does what ``predict`` does."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import lq_plant
+import numpy as np
+import pytest
+from mpc_problems import CARTPOLE, LINEAR, PENDULUM, random_linear, random_states
+
+from mpcoffline import MPCPolicy, OfflineMPCLearner
+from mpcoffline.control.export import export_c
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.mpc import MPC, NetworkCost
+from mpcoffline.plants.nominal import nominal_mpc
+from mpcoffline.solvers.ddp.build import find_compiler
+
+STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
+
+
+def mpc_of(case: str) -> MPC:
+    if case == "three inputs":
+        return random_linear(0, nu=3)
+    if case == "network":
+        network = NetworkCost.random(3, (6, 6), seed=0, scale=10.0, W=np.eye(3), x_ref=[1.0, 0.0, 0.0])
+        return nominal_mpc(PENDULUM).replace(horizon=10, discount=0.95, terminal_cost=network)
+    mpc = nominal_mpc(case)
+    return mpc.replace(horizon=min(mpc.horizon, 50))
+
+
+def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
+    sources = [str(folder / "mpc_controller.c"), str(folder / main)]
+    command = [find_compiler(), *STRICT, *flags, "-I", str(folder), *sources, "-o", str(folder / "program"), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "program"
+
+
+@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "three inputs", "network"])
+def test_the_c_code_replays_its_vectors(case: str, tmp_path: Path) -> None:
+    files = export_c(MPCPolicy(mpc_of(case)), tmp_path)
+    assert {file.name for file in files} >= {"mpc_controller.c", "mpc_controller.h", "CMakeLists.txt"}
+    program = compiled(tmp_path)
+    done = subprocess.run([program, tmp_path / "test_vectors.txt"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    steps = re.match(r"(\d+) steps, 0 not solved", done.stdout)
+    assert steps
+    assert int(steps[1]) >= 40
+
+
+def test_without_vectors_nothing_is_said_to_pass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("mpcoffline.control.export._unambiguous_starts", lambda policy: [])
+    export_c(MPCPolicy(mpc_of(LINEAR)), tmp_path)
+    assert "No test vectors" in caplog.text
+    done = subprocess.run(
+        [compiled(tmp_path), tmp_path / "test_vectors.txt"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "no test vectors: nothing was tested\n")
+
+
+MAIN = """
+#include <stdio.h>
+#include "mpc_controller.h"
+int main(void) {
+    static mpc_state state;
+    double y[MPC_NX], u[MPC_NU];
+    int reset;
+    while (scanf("%d", &reset) == 1) {
+        for (int i = 0; i < MPC_NX; ++i) if (scanf("%lf", &y[i]) != 1) return 1;
+        if (reset) mpc_reset(&state);
+        if (mpc_step(&mpc_learned_parameters, &state, y, u)) return 2;
+        for (int a = 0; a < MPC_NU; ++a) printf("%.17g\\n", u[a]);
+    }
+    return 0;
+}
+"""
+
+
+def test_it_is_predict_on_other_states(tmp_path: Path) -> None:
+    """A saved policy, exported from its file; swing-ups with disturbances, step by step beside ``predict``."""
+    policy = MPCPolicy(nominal_mpc(CARTPOLE, alpha=0.5, seed=1))
+    policy.save(tmp_path / "policy.zip")
+    export_c(tmp_path / "policy.zip", tmp_path)
+    (tmp_path / "main.c").write_text(MAIN)
+    program = compiled(tmp_path, main="main.c")
+    rng = np.random.default_rng(0)
+    lines, expected = [], []
+    for start in random_states(CARTPOLE, 3):
+        y, state = start, None
+        for step in range(30):
+            action, state = policy.predict(y, state)
+            lines.append(" ".join([str(int(step == 0)), *map(repr, y.tolist())]))
+            expected.append(float(action[0]))
+            y = policy.mpc.model(y, action) + 1e-3 * rng.normal(size=5)
+    done = subprocess.run([program], input="\n".join(lines), capture_output=True, text=True, check=True)
+    np.testing.assert_allclose(np.array(done.stdout.split(), float), expected, rtol=0, atol=1e-6)
+
+
+def test_the_header_documents_names_and_units(tmp_path: Path) -> None:
+    export_c(MPCPolicy(nominal_mpc(PENDULUM)), tmp_path)
+    header = (tmp_path / "mpc_controller.h").read_text()
+    assert re.search(r"double model_m; /\* model.m: number, in kg \*/", header)
+    assert re.search(r"double stage_cost_W\[6\]; /\* .*C C'", header)
+    assert "every 0.05 s" in header
+    assert "u[0]: from -2 to 2" in header
+    export_c(MPCPolicy(mpc_of("network")), tmp_path / "network")
+    header = (tmp_path / "network" / "mpc_controller.h").read_text()
+    assert re.search(r"double terminal_cost_weights_1\[36\]; /\* .*shape \(6, 6\), row by row \*/", header)
+    source = (tmp_path / "mpc_controller.c").read_text()
+    assert "malloc" not in source
+    assert set(re.findall(r"#include\s+(\S+)", source)) == {'"mpc_controller.h"', "<math.h>", "<stdint.h>"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [PENDULUM, "network"])
+def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc")
+    export_c(MPCPolicy(mpc_of(case)), tmp_path)
+    try:
+        program = compiled(tmp_path, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    except AssertionError as error:
+        if "san" in str(error) and "cannot find" in str(error):
+            pytest.skip("the compiler's sanitizer libraries are not installed")
+        raise
+    done = subprocess.run([program, tmp_path / "test_vectors.txt"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_state_that_overflows_is_said_and_bounded(tmp_path: Path) -> None:
+    """The step returns that it has no plan, and an input within bounds."""
+    export_c(MPCPolicy(nominal_mpc(PENDULUM)), tmp_path)
+    (tmp_path / "main.c").write_text(
+        MAIN.replace("return 2", 'printf("unsolved\\n")').replace("static mpc_state", "static mpc_state")
+    )
+    program = compiled(tmp_path, main="main.c")
+    lines = "1 1e300 1e300 1e300\n0 1.0 0.0 0.0\n"
+    done = subprocess.run([program], input=lines, capture_output=True, text=True, check=True)
+    first, action, second = done.stdout.split()
+    assert first == "unsolved"
+    assert abs(float(action)) <= 2.0
+    assert abs(float(second)) < 1e-6  # the next, sound state is solved as if nothing had been
+
+
+def test_a_learners_file_is_taken_as_a_policys(tmp_path: Path) -> None:
+    learner = OfflineMPCLearner(lq_plant.make_mpc(), preset="paper", value_n_steps=1, fit_n_steps=1, hidden=(4,))
+    learner.fit(lq_plant.random_log(50), show_progress=False)
+    learner.save(tmp_path / "learner.zip")
+    learner.policy.save(tmp_path / "policy.zip")
+    for name in ("learner", "policy"):
+        export_c(tmp_path / f"{name}.zip", tmp_path / name)
+    for name in ("mpc_controller.c", "test_vectors.txt"):
+        assert (tmp_path / "learner" / name).read_text() == (tmp_path / "policy" / name).read_text()
+
+
+def test_constraints_are_refused(tmp_path: Path) -> None:
+    mpc = nominal_mpc(PENDULUM).replace(constraints=lambda x, u, p: x[2] - 5.0)
+    with pytest.raises(InvalidArgumentError, match="constraints"):
+        export_c(MPCPolicy(mpc), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "policy.zip").write_bytes(b"no zip")
+    with pytest.raises(FileFormatError):
+        export_c(tmp_path / "policy.zip", tmp_path / "out")
