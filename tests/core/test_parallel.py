@@ -76,7 +76,7 @@ def test_ctrl_c_ends_all_processes_and_shows_one_traceback(tmp_path: Path) -> No
     script.write_text(
         textwrap.dedent("""
         import signal
-        from mpcoffline import parallel
+        from mpcoffline.core import parallel
         if __name__ == "__main__":
             # A shell that starts tests in the background leaves them deaf to Ctrl-C.
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -12,11 +12,13 @@ from typing import Literal
 from filelock import FileLock, Timeout
 
 from mpcoffline.core.caches import KINDS, disk_size, entries, remove
-from mpcoffline.core.errors import UnknownIdError
+from mpcoffline.core.errors import MPCOfflineError, UnknownIdError
 from mpcoffline.core.places import cache_root, temporary_root
 from mpcoffline.core.scratch import abandoned, remove_abandoned
+from mpcoffline.datasets.record.recording import seal
+from mpcoffline.datasets.record.same_recording import sealed_recordings
 from mpcoffline.datasets.store.local import dataset_path
-from mpcoffline.datasets.store.recording_lock import empty_recordings, remove_empty
+from mpcoffline.datasets.store.recording_lock import empty_recordings, recording_path, remove_empty
 
 Kind = Literal["leftovers", "caches", "downloads", "backups"]
 
@@ -116,6 +118,10 @@ def clean(kinds: Iterable[Kind] = DEFAULT_KINDS, *, remove_found: bool = False) 
 def _without(waste: Waste) -> Waste:
     if waste.kind == "downloads" and not _is_free(waste.path.with_name(waste.path.name + ".lock")):
         return waste  # begun again meanwhile
+    for name in sealed_recordings():
+        if waste.path == recording_path(name):
+            with suppress(MPCOfflineError):  # the data set is damaged: the logs are all there is
+                seal(name)
     if waste.path in empty_recordings():
         remove_empty(waste.path)
     elif waste.kind == "leftovers":
@@ -134,7 +140,7 @@ def _leftovers() -> Iterator[Waste]:
         with suppress(OSError):
             for path in abandoned(place):
                 yield Waste("leftovers", path, disk_size(path))
-    for path in empty_recordings():
+    for path in [*empty_recordings(), *map(recording_path, sealed_recordings())]:
         yield Waste("leftovers", path, disk_size(path))
 
 

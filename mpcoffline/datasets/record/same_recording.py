@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from mpcoffline.datasets.store.local import dataset_path, is_local, recording_of
 from mpcoffline.datasets.store.opening import read_metadata
 from mpcoffline.datasets.store.recording_lock import log_files
 
-from .episode_log import LogIndex
+from .episode_log import LogIndex, scan
 from .log_records import LogHeader
 
 
@@ -117,6 +118,18 @@ def set_aside(dataset_id: str) -> Path:
     except OSError as error:
         raise StorageError.of(kept, error) from error
     return kept
+
+
+def sealed_recordings() -> list[str]:
+    """Ids of recordings whose logs are in their data set: the process was killed before it had removed them."""
+    root, found = dataset_path("") / ".recording", []
+    for folder in sorted({path.parent for path in root.rglob("env-*.log")} if root.is_dir() else ()):
+        name = folder.relative_to(root).as_posix()
+        sealed = recording_of(name)
+        with suppress(FileFormatError, OSError):
+            if sealed is not None and common_header([scan(path) for path in log_files(name)]).recording == sealed:
+                found.append(name)
+    return found
 
 
 def remove_logs(dataset_id: str) -> None:
