@@ -9,7 +9,6 @@ import fcntl
 import os
 import re
 import tempfile
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -22,7 +21,6 @@ from mpcoffline.core.files import check_regular
 from .errors import FileFormatError, StorageError
 
 _UNIQUE = re.compile("[0-9a-f]{12}")
-_JUST_NOW = 60.0  # s
 
 
 @contextmanager
@@ -46,9 +44,7 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     temporary = target.with_name(f"{begin}{uuid.uuid4().hex[:12]}")
     try:
         _remove_abandoned(target.parent, begin)
-        with temporary.open("xb") as file:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX)
+        with _locked(temporary) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -62,15 +58,26 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
         raise
 
 
+def _locked(path: Path) -> IO[bytes]:
+    """A new file with a lock: who looks for abandoned ones may have taken the first before it had one."""
+    while True:
+        file = path.open("xb")
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        with suppress(FileNotFoundError):
+            if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                return file
+        file.close()
+
+
 def _remove_abandoned(folder: Path, begin: str) -> None:
     """Removes the temporary files that nobody writes any more: the system gives their locks back with their process."""
     with suppress(OSError), os.scandir(folder) as entries:
         names = [e.name for e in entries if e.name.startswith(begin) and _UNIQUE.fullmatch(e.name[len(begin) :])]
         for name in names:
             with suppress(OSError), (folder / name).open("rb") as file:
-                if time.time() - os.fstat(file.fileno()).st_mtime > _JUST_NOW:  # it may not be locked yet
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    (folder / name).unlink()
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                (folder / name).unlink()
 
 
 def write_file(path: str | PathLike[str], content: bytes | str) -> Path:

@@ -44,7 +44,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
     except Timeout as error:
         raise OSError(f"the lock of {folder} cannot be had") from error
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
         lock.release()
 
 
@@ -64,7 +64,13 @@ def remove_abandoned(folder: Path) -> None:
         folder.rmdir()
         return
     if _is_abandoned(folder):
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """The lock goes last: what a killed process leaves of the rest is abandoned as well."""
+    shutil.rmtree(folder / _CONTENT, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_abandoned(folder: Path) -> bool:
