@@ -18,7 +18,7 @@ def test_every_public_name_exists_and_is_listed(name: str) -> None:
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="'mpcoffline' has no attribute 'MCP'"):
+    with pytest.raises(AttributeError, match="No mpcoffline attribute MCP"):
         mpcoffline.MCP  # noqa: B018
 
 

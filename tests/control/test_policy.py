@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from mpcoffline.control.evaluation import evaluate
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.mpc import MPC
 from mpcoffline.plants.nominal import nominal_mpc
@@ -510,9 +510,9 @@ def test_unbounded_spaces_survive(tmp_path: Path) -> None:
     assert (loaded.observation_space, loaded.action_space) == (policy.observation_space, policy.action_space)
 
 
-def test_a_learners_file_is_not_a_policy(tmp_path: Path) -> None:
+def test_a_learner_that_has_not_learned_has_no_policy(tmp_path: Path) -> None:
     OfflineMPCLearner(lq_plant.make_mpc()).save(tmp_path / "l.zip")
     before = (tmp_path / "l.zip").read_bytes()
-    with pytest.raises(FileFormatError, match=r"expected an mpcoffline policy file, got .*'learner'"):
+    with pytest.raises(MPCOfflineError, match="expected a learner that has learned, got one before its fit"):
         MPCPolicy.load(tmp_path / "l.zip")
     assert (tmp_path / "l.zip").read_bytes() == before

@@ -18,6 +18,7 @@ from minari.data_collector import EpisodeBuffer
 
 import mpcoffline.control.policy
 import mpcoffline.solvers
+from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import (
     FileFormatError,
     InvalidArgumentError,
@@ -517,6 +518,9 @@ def test_the_environments_observation_space_is_kept(tmp_path: Path) -> None:
     learner.fit(dataset, show_progress=False)
     learner.save(tmp_path / "l.zip")
     assert OfflineMPCLearner.load(tmp_path / "l.zip").policy.observation_space == dataset.observation_space
+    policy = MPCPolicy.load(tmp_path / "l.zip")  # a learner's file has its policy
+    assert policy.observation_space == dataset.observation_space
+    assert policy.mpc.theta.tolist() == learner.theta.tolist()
 
 
 def test_saving_over_a_learner_replaces_it(tmp_path: Path) -> None:

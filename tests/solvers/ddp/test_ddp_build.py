@@ -157,7 +157,7 @@ def child(tmp_path: Path, **environment: str) -> subprocess.Popen[str]:
     """A process that builds and uses the solver."""
     script = tmp_path / "child.py"
     script.write_text(SCRIPT)
-    helpers = Path(__file__).parent.parent / "helpers"
+    helpers = Path(__file__).parents[2] / "helpers"
     env = os.environ | {"PYTHONPATH": str(helpers)} | environment
     return subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True)
 
