@@ -15,7 +15,7 @@ from mpcoffline.core.caches import KINDS, disk_size, entries, remove
 from mpcoffline.core.errors import UnknownIdError
 from mpcoffline.core.places import cache_root, temporary_root
 from mpcoffline.core.scratch import abandoned, remove_abandoned
-from mpcoffline.datasets.store.local import dataset_path
+from mpcoffline.datasets.store.ids import dataset_path
 from mpcoffline.datasets.store.recording_lock import empty_recordings, remove_empty
 
 Kind = Literal["leftovers", "caches", "downloads", "backups"]

@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING
 from mpcoffline.core.atomic import publish
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError, UnknownIdError
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.datasets.store.local import _declare_namespace, check_dataset_id, dataset_path, is_local, load_dataset
+from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.manifest import MANIFEST, differences, read_manifest, sha256_of, write_manifest
 from mpcoffline.datasets.store.opening import open_dataset
 from mpcoffline.datasets.store.recording_lock import check_not_recorded
 from mpcoffline.datasets.store.verification import verify
+from mpcoffline.datasets.store.writing import declare_namespace
 
 from .remotes import SETTING, Listing, Remote, RemoteError, fetch, open_remote, remote_errors
 
@@ -126,7 +127,7 @@ def download_dataset(
     """
     check_dataset_id(dataset_id)
     if is_local(dataset_id) and not overwrite:
-        return load_dataset(dataset_id)
+        return open_dataset(dataset_path(dataset_id))
     source = find_source(dataset_id, remote, revision)
     if source is None:
         raise InvalidArgumentError(
@@ -145,13 +146,13 @@ def download_dataset(
             _fetch_all(place, listing, staged, unchecked=unchecked, progress=progress)
         _check(staged, dataset_id, source, unchecked=unchecked)
         try:
-            _declare_namespace(dataset_id)
+            declare_namespace(dataset_id)
             publish(staged, dataset_path(dataset_id), overwrite=overwrite)
         except OSError as error:
             if not is_local(dataset_id) or overwrite:
                 raise StorageError.of(dataset_path(dataset_id), error) from error
         shutil.rmtree(folder, ignore_errors=True)
-    return load_dataset(dataset_id)
+    return open_dataset(dataset_path(dataset_id))
 
 
 def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | None = None) -> UploadReceipt:

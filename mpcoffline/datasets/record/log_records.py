@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError
-from mpcoffline.datasets.checks import NUMBERS, check_numbers
+from mpcoffline.datasets.table.numbers import NUMBERS, check_numbers
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.checks import check_integers, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
-from mpcoffline.datasets.checks import floats, real_numbers
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.datasets.table.arrays import types_that_hold
+from mpcoffline.datasets.table.numbers import floats, real_numbers
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 from .plants import check_spaces, check_units, in_units, opened, plain_spec, step_cap

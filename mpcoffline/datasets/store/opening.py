@@ -32,7 +32,7 @@ from mpcoffline.core.limits import (
 from mpcoffline.core.places import cache_folder
 
 from .hdf5_guard import check_episodes, check_hdf5
-from .ids import is_valid_id
+from .ids import dataset_path, is_valid_id
 from .manifest import MANIFEST, differences
 
 if TYPE_CHECKING:
@@ -333,10 +333,8 @@ def _remember(folder: Path, state: str) -> None:
 
 def _id_of(folder: Path) -> str:
     """The id of a folder in the local store; its path for any other."""
-    from minari.storage import get_dataset_path
-
     try:
-        return folder.relative_to(get_dataset_path("")).as_posix()
+        return folder.relative_to(dataset_path("")).as_posix()
     except ValueError:
         return str(folder)
 

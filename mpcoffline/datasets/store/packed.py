@@ -26,8 +26,8 @@ from mpcoffline.core.errors import FileFormatError, InvalidDataError, StorageErr
 from mpcoffline.envs import ControlTask
 
 from .hdf5_guard import check_hdf5
-from .local import write_dataset
-from .writing import SteadyFile, write_steadily
+from .hdf5_writing import SteadyFile, write_steadily
+from .writing import write_dataset
 
 if TYPE_CHECKING:
     from minari import MinariDataset

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidDataError, StorageError
-from mpcoffline.datasets.checks import check_finite
 from mpcoffline.datasets.store.opening import DATA_FILE, check_stored
 
 from .cache import TableFile, cached_table, content_key, scratch_table, table_folder
 from .centring import Centring, Digits
 from .hdf5_episodes import EpisodeColumns, read_episodes
+from .numbers import check_finite
 
 if TYPE_CHECKING:
     from minari import MinariDataset

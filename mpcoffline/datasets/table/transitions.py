@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
-from mpcoffline.datasets.checks import check_bounds, check_sizes
 
 from .arrays import read_arrays
 from .build import BuiltRows, read_minari
 from .cache import TableFile, default_memory, scratch_table
 from .centring import Centring
 from .math import CHUNK, Columns, TableStatistics, innermost, moments, split
+from .numbers import check_bounds, check_sizes
 from .sampler import block_batches, gather_batches
 
 __all__ = ["Columns", "TableStatistics", "TransitionTable"]
@@ -222,7 +222,7 @@ class TransitionTable:
             StorageError: Where a table larger than ``memory`` cannot be written.
         """
         if isinstance(dataset, str):
-            from mpcoffline.datasets.store.local import load_dataset
+            from mpcoffline.datasets.hub.loading import load_dataset
 
             dataset = load_dataset(dataset)
         name = f"data set {dataset.spec.dataset_id!r}"

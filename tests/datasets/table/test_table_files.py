@@ -19,7 +19,7 @@ from pendulum_data import resealed
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.datasets.table import build as table_build
 from mpcoffline.datasets.table import cache as table_cache
 from mpcoffline.datasets.table.hdf5_episodes import COLUMNS, read_episodes

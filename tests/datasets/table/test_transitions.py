@@ -20,7 +20,7 @@ from pendulum_data import resealed
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
