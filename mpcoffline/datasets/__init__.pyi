@@ -22,10 +22,10 @@ from .interop.convert import (
 from .interop.convert import (
     to_torchrl as to_torchrl,
 )
-from .record.logs import dataset_from_arrays as dataset_from_arrays
-from .record.logs import from_csv as from_csv
-from .record.logs import record as record
+from .record.from_arrays import dataset_from_arrays as dataset_from_arrays
+from .record.from_csv import from_csv as from_csv
 from .record.recorder import MinariRecorder as MinariRecorder
+from .record.rollouts import record as record
 from .store.local import list_datasets as list_datasets
 from .store.verification import VerifyReport as VerifyReport
 from .store.verification import verify as verify

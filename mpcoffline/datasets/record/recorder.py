@@ -18,7 +18,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.store.writing import check_new_dataset
 from mpcoffline.datasets.table.numbers import check_storable
 
-from .episodes import EpisodeBuilder
+from .episode_builder import EpisodeBuilder
 from .plants import common_spec
 from .recording import Recording
 from .stage_cost import PlantInfo

@@ -24,8 +24,8 @@ from mpcoffline.datasets.store.writing import check_new_dataset, recording_of, w
 from mpcoffline.datasets.table.numbers import check_storable
 
 from .episode_log import EpisodeLog, LogIndex, scan
-from .log_records import LoggedEpisode, LogHeader
-from .same_recording import are_continued, check_extends, common_header, origin_json, remove_logs, set_aside
+from .log_format import LoggedEpisode, LogHeader
+from .resuming import are_continued, check_extends, common_header, origin_json, remove_logs, set_aside
 
 if TYPE_CHECKING:
     from minari import MinariDataset

@@ -15,7 +15,7 @@ from mpcoffline.datasets.store.recording_lock import log_files
 from mpcoffline.datasets.store.writing import recording_of
 
 from .episode_log import LogIndex
-from .log_records import LogHeader
+from .log_format import LogHeader
 
 
 def common_header(indices: list[LogIndex]) -> LogHeader:
