@@ -6,7 +6,6 @@ without it there is none. The layout is Minari's too: what is uploaded here, ``m
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -19,8 +18,11 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from filelock import FileLock, Timeout
+
 from mpcoffline.core.atomic import publish
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError, UnknownIdError
+from mpcoffline.core.outputs import write_file
 from mpcoffline.datasets.recipes import catalog_file
 from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.manifest import MANIFEST, differences, read_manifest, sha256_of, write_manifest
@@ -301,25 +303,23 @@ def _download_folder(dataset_id: str) -> Iterator[Path]:
     label = dataset_id.replace("/", "--")
     if len(os.fsencode(label)) > 200:  # names of files end at 255 bytes
         label = hashlib.sha256(os.fsencode(dataset_id)).hexdigest()
-    folder = root / label
+    folder, lock = root / label, FileLock(root / f"{label}.lock", thread_local=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(root / f"{folder.name}.lock", os.O_RDWR | os.O_CREAT, 0o644)
+        lock.acquire(timeout=0.0)
+    except Timeout as error:
+        raise StorageError(
+            f"data set {dataset_id!r}",
+            expected="one download at a time",
+            actual="another process that downloads it now",
+            hint="Wait for it to finish.",
+        ) from error
     except OSError as error:
         raise StorageError.of(folder, error) from error
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise StorageError(
-                f"data set {dataset_id!r}",
-                expected="one download at a time",
-                actual="another process that downloads it now",
-                hint="Wait for it to finish.",
-            ) from error
         yield folder
     finally:
-        os.close(descriptor)
+        lock.release()
 
 
 def _begin(folder: Path, remote: str, revision: str) -> None:
@@ -327,7 +327,7 @@ def _begin(folder: Path, remote: str, revision: str) -> None:
     label, content = folder / "source.json", json.dumps({"remote": remote, "revision": revision})
     if not label.exists() or label.read_text(encoding="utf-8") != content:
         shutil.rmtree(folder / "dataset", ignore_errors=True)
-        label.write_text(content, encoding="utf-8")
+        write_file(label, content)
 
 
 def _is_complete(folder: Path, source: Source) -> bool:

@@ -42,7 +42,7 @@ class DatasetRow:
 
 def is_here(dataset_id: str) -> bool:
     """Whether :func:`open_local` gives it."""
-    return dataset_id in shipped_datasets() or (is_valid_id(dataset_id) and is_local(dataset_id))
+    return is_valid_id(dataset_id) and (is_local(dataset_id) or dataset_id in shipped_datasets())
 
 
 def open_local(dataset_id: str) -> MinariDataset:
@@ -55,10 +55,8 @@ def open_local(dataset_id: str) -> MinariDataset:
         UnknownIdError: For an id that is not on this machine; it names the nearest ones.
         FileFormatError: For a damaged data set, or a shipped file that does not have its sha256.
     """
-    if is_valid_id(dataset_id) and is_local(dataset_id):
-        return open_dataset(dataset_path(dataset_id))
-    if (file := shipped_datasets().get(dataset_id)) is not None:
-        return _unpacked(dataset_id, file)
+    if is_here(dataset_id):
+        return open_dataset(dataset_path(dataset_id)) if is_local(dataset_id) else _unpacked(dataset_id)
     known = sorted({*local_datasets(), *shipped_datasets()})
     nearest = difflib.get_close_matches(str(dataset_id), known, n=3, cutoff=0.4)
     hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}? " if nearest else ""
@@ -125,8 +123,9 @@ def shipped_datasets() -> dict[str, str]:
     return {Recipe.load(task).dataset_id: f"{task}.h5" for task in TASKS if catalog_file(f"{task}.h5").is_file()}
 
 
-def _unpacked(dataset_id: str, file: str) -> MinariDataset:
+def _unpacked(dataset_id: str) -> MinariDataset:
     """Puts a shipped data set into the store, after checking that its file is the one that was shipped."""
+    file = shipped_datasets()[dataset_id]
     expected = parse_manifest(catalog_file(MANIFEST).read_bytes()).get(file, "(none listed)")
     with importlib.resources.as_file(catalog_file(file)) as path:
         if (actual := sha256_of(path)) != expected:

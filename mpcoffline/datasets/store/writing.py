@@ -7,7 +7,6 @@ import errno
 import importlib.metadata
 import itertools
 import json
-import os
 import shutil
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -19,6 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from mpcoffline.core.atomic import publish, sync_tree
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError
+from mpcoffline.core.outputs import write_file
 from mpcoffline.core.scratch import scratch_folder
 
 from .hdf5_writing import store_episodes
@@ -153,10 +153,7 @@ def finish(building: Path, metadata: dict[str, str]) -> None:
     """Completes a data set's folder: data on the disk, then its metadata, then the manifest of both."""
     sync_tree(building)
     path = building / "data" / "metadata.json"
-    complete = json.loads(path.read_text(encoding="utf-8")) | metadata
-    new = path.with_suffix(".new")
-    new.write_text(json.dumps(complete), encoding="utf-8")
-    os.replace(new, path)
+    write_file(path, json.dumps(json.loads(path.read_text(encoding="utf-8")) | metadata))
     write_manifest(building)
     building.chmod(0o755)
 
