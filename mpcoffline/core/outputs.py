@@ -1,4 +1,4 @@
-"""Files that users name for results: replaced only as a whole, and refused before the work, not after it.
+"""Files that appear complete or not at all: replaced only as a whole, and refused before the work, not after it.
 
 What exists and is no regular file (a device, a FIFO, a socket, a folder) is never opened and never replaced.
 """
@@ -16,9 +16,9 @@ from os import PathLike
 from pathlib import Path
 from typing import IO
 
-from mpcoffline.core.files import check_regular
-
+from .atomic import sync_folder
 from .errors import FileFormatError, StorageError
+from .files import check_regular
 
 _UNIQUE = re.compile("[0-9a-f]{12}")
 
@@ -49,7 +49,8 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)
-        _sync_folder(target.parent)
+        with suppress(OSError):  # a file system that cannot say so
+            sync_folder(target.parent)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
@@ -172,13 +173,3 @@ def _check_takes_files(folder: Path) -> None:
             file.write(b"0")
     except OSError as error:
         raise StorageError.of(f"in folder {folder}", OSError(error.strerror or str(error))) from error
-
-
-def _sync_folder(folder: Path) -> None:
-    """Waits until the new name is on the disk, where the file system can say so."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

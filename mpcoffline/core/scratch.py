@@ -79,7 +79,15 @@ def _is_abandoned(folder: Path) -> bool:
             return True
         if not (folder / _LOCK).is_file():
             return time.time() - folder.stat().st_mtime > _HOUR
-        with FileLock(folder / _LOCK, timeout=0.0, thread_local=False):
+        return is_free(folder / _LOCK)
+    except OSError:  # another user's
+        return False
+
+
+def is_free(lock: Path) -> bool:
+    """Whether no living process holds a lock file that this one may open."""
+    try:
+        with FileLock(lock, timeout=0.0, thread_local=False):
             return True
-    except (OSError, Timeout):  # another user's, or a living process's
+    except (OSError, Timeout):
         return False

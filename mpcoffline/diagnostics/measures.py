@@ -94,16 +94,15 @@ def returns_of(value: ValueFunction, table: TransitionTable, discount: float) ->
         discount: gamma.
     """
     needed = int(np.ceil(np.log(_TAIL) / np.log(discount))) if discount < 1.0 else len(table)
-    ids, firsts, lengths = np.unique(table.episode_ids, return_index=True, return_counts=True)
+    episodes, n_episodes = table.episodes, table.n_episodes
     observations, returns = [], []
-    for k in range(len(ids) - min(max(1, len(ids) // 10), _MOST_EPISODES), len(ids)):
-        rows = np.arange(firsts[k], firsts[k] + lengths[k])
-        episode = table.take(rows)
+    for k in range(n_episodes - min(max(1, n_episodes // 10), _MOST_EPISODES), n_episodes):
+        episode = table.take(episodes.rows(k))
         costs, ended = episode.costs.astype(np.float64), episode.terminations[-1] > 0.0
-        total = np.zeros(len(rows) + 1)
-        for t in range(len(rows) - 1, -1, -1):
+        total = np.zeros(len(episode) + 1)
+        for t in range(len(episode) - 1, -1, -1):
             total[t] = costs[t] + discount * total[t + 1]
-        complete = len(rows) if ended else max(0, len(rows) - needed)
+        complete = len(episode) if ended else max(0, len(episode) - needed)
         observations.append(episode.observations[:complete])
         returns.append(total[:complete])
     return value.predict(np.concatenate(observations)), np.concatenate(returns)
@@ -131,7 +130,7 @@ def fit_errors(
         table: The transitions.
         result: What (FIT) found; its potential, if there is one, counts.
     """
-    sample = _sample(table, 0)
+    sample = table.sample(_ROWS, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
     unit = variance_of(sample.costs)
     before, after = (
@@ -169,7 +168,7 @@ def outside_support(table: TransitionTable, states: Array) -> float:
 
     By the distance to the nearest logged state, coordinates in spreads of the data.
     """
-    sample = _sample(table, 1, 2 * _TREE_ROWS)
+    sample = table.sample(2 * _TREE_ROWS, 1)
     spread = sample.observations.std(axis=0)
     scale = np.where(spread > 0.0, spread, 1.0).astype(np.float64)
     order = np.random.default_rng(0).permutation(len(sample))
@@ -184,13 +183,13 @@ def outside_support(table: TransitionTable, states: Array) -> float:
 
 def predicted_states(mpc: MPC, table: TransitionTable) -> Array:
     """f_theta(s, a) on some of the data, ``(n, nx)``."""
-    sample = _sample(table, 2, _TREE_ROWS)
+    sample = table.sample(_TREE_ROWS, 2)
     return mpc.model(sample.observations, sample.actions)
 
 
 def one_step_error(mpc: MPC, table: TransitionTable) -> float:
     """Root mean square one-step prediction error, every coordinate in the spread of its increments."""
-    sample = _sample(table, 3)
+    sample = table.sample(_ROWS, 3)
     s, reached = (v.astype(np.float64) for v in (sample.observations, sample.next_observations))
     missed = (mpc.model(s, sample.actions) - reached) / increments_scale(s, reached, table.centring.centre[: table.ny])
     return float(np.sqrt(np.mean(np.nan_to_num(missed, nan=1e3, posinf=1e3, neginf=-1e3) ** 2)))
@@ -255,9 +254,3 @@ def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
         if name not in factors and (value - low < near or high - value < near) and before.get(name) != value:
             names.append(name)
     return tuple(names)
-
-
-def _sample(table: TransitionTable, seed: int, count: int = _ROWS) -> TransitionTable:
-    """Some rows, in order."""
-    rows = np.sort(np.random.default_rng(seed).permutation(len(table))[:count])
-    return table.take(rows)

@@ -294,8 +294,8 @@ def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: n
     """A random subset in float64, small enough for its Jacobian."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
     count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
-    chosen = np.sort(rng.permutation(len(table))[:count])
-    columns = table.columns(table.rows[chosen])
+    sample = table.sample(count, rng)
+    columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)
     return Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
 

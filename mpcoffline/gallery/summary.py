@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.outputs import check_output, write_file
 from mpcoffline.core.text import markdown, visible
-from mpcoffline.datasets.checks import check_numbers
+from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.datasets.store.local import load_dataset, shipped_datasets
+from mpcoffline.datasets.store.local import shipped_datasets
+from mpcoffline.datasets.table.numbers import check_numbers
 
 from .cards import PANELS, Axis, coverage_figure
 

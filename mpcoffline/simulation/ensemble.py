@@ -101,7 +101,7 @@ class _Episodes:
 
     def __init__(self, table: TransitionTable) -> None:
         self._n_rows = len(table)
-        ids, self._first, self._length = np.unique(table.episode_ids, return_index=True, return_counts=True)
+        ids, self._first, self._length = table.episodes
         if len(ids) < _FEW_EPISODES:
             self._first, self._length = np.arange(len(table)), np.ones(len(table), dtype=np.int64)
 

@@ -186,8 +186,9 @@ def _controller_result(
 
 def _behaviour(table: TransitionTable, discount: float) -> ControllerResult:
     """The costs of the last episodes in the data: how good the agent that recorded them had become."""
-    last = np.unique(table.episode_ids)[-_LAST_EPISODES:]
-    episodes = [table.costs[table.episode_ids == i].astype(np.float64) for i in last]
+    places = table.episodes
+    last = range(len(places.ids))[-_LAST_EPISODES:]
+    episodes = [table.take(places.rows(k)).costs.astype(np.float64) for k in last]
     return ControllerResult(
         name="behaviour",
         description=f"the agent that made the data, its last {len(last)} episodes (own starts, with exploration)",

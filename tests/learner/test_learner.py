@@ -27,7 +27,7 @@ from mpcoffline.core.errors import (
     UnknownIdError,
 )
 from mpcoffline.datasets import TransitionTable, load_dataset
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learner.presets import PRESETS
 from mpcoffline.learning import ValueFunction

@@ -25,17 +25,12 @@ from mpcoffline.core.limits import METADATA_BYTES
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.record.recording import seal
 from mpcoffline.datasets.store.hdf5_guard import check_episodes, episode_number
-from mpcoffline.datasets.store.local import (
-    check_dataset_id,
-    dataset_path,
-    finish,
-    is_local,
-    list_datasets,
-    recording_of,
-)
+from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
+from mpcoffline.datasets.store.local import list_datasets
 from mpcoffline.datasets.store.manifest import MANIFEST, differences
 from mpcoffline.datasets.store.opening import DATA_FILE, check_space, open_dataset
 from mpcoffline.datasets.store.recording_lock import RecordingLock, log_files, recording_path
+from mpcoffline.datasets.store.writing import finish, recording_of
 
 _STEPS = ("actions", "rewards", "terminations", "truncations")
 

@@ -14,7 +14,7 @@ import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.core.text import visible
-from mpcoffline.datasets.store.local import load_dataset
+from mpcoffline.datasets.hub.loading import load_dataset
 
 from .rebuilding import without_window
 from .simulation import QUANTITIES, TOLERANCES, Deviation, Simulation

@@ -16,7 +16,8 @@ from mpcoffline.core.errors import FileFormatError, StorageError
 from mpcoffline.core.text import visible
 
 from .hdf5_guard import episode_number
-from .local import check_dataset_id, dataset_path, is_local, load_dataset
+from .ids import check_dataset_id, dataset_path, is_local
+from .local import open_local
 from .manifest import MANIFEST, differences, write_manifest
 from .opening import DATA_FILE, faults_of, open_to_examine
 
@@ -147,7 +148,7 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
         if isinstance(dataset, str) and is_local(dataset_id):
             dataset, faults = open_to_examine(folder)
         else:
-            dataset = load_dataset(dataset_id, download=False) if isinstance(dataset, str) else dataset
+            dataset = open_local(dataset_id) if isinstance(dataset, str) else dataset
             faults = faults_of(folder)
         report = _report(dataset, dataset_id, folder, faults)
     except (FileFormatError, OSError) as error:

@@ -31,6 +31,24 @@ class Columns(NamedTuple):
     terminations: Any
 
 
+class Episodes(NamedTuple):
+    """Where the episodes of a table lie, ordered by their ids.
+
+    Attributes:
+        ids: Ids, ``(E,)``.
+        firsts: First row of each, ``(E,)``.
+        lengths: Number of rows of each, ``(E,)``.
+    """
+
+    ids: NDArray[np.int64]
+    firsts: NDArray[np.intp]
+    lengths: NDArray[np.intp]
+
+    def rows(self, number: int) -> slice:
+        """The rows of the episode of that place among the ids; a negative one counts from the end."""
+        return slice(int(self.firsts[number]), int(self.firsts[number] + self.lengths[number]))
+
+
 class TableStatistics(NamedTuple):
     """Moments and ranges of a table's columns, float64: vectors for observations and actions, else numbers.
 

@@ -142,8 +142,7 @@ class ParameterTraining:
             _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
         self._rng = np.random.default_rng(seed)
         self._problem = BellmanFit(mpc, value, variance_of(costs))
-        rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
-        self._sample = table.columns(torch.from_numpy(table.rows[rows]))
+        self._sample = table.columns(torch.from_numpy(table.sample(config.refit_rows, self._rng).rows))
         self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))
         self._coordinates = Coordinates(mpc, groups)
         with torch.no_grad():

@@ -49,9 +49,9 @@ def episode(steps: int = 20) -> tuple[Any, Any, Any]:
 STORING = """
 import os, signal
 import numpy as np
+from mpcoffline.datasets.store import writing
 from mpcoffline.datasets import dataset_from_arrays
-from mpcoffline.datasets.store import local
-local.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
+writing.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
 dataset_from_arrays("mine/plant/log-v0", [(np.zeros((21, 3)), np.zeros((20, 1)), np.zeros(20))])
 """
 

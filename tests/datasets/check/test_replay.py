@@ -18,7 +18,7 @@ from rich.console import Console
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.datasets.check.replaying import recover_environment, replay
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.envs import ENV_IDS
 
 LINEAR = "mpcoffline/LinearTracking-v0"

@@ -22,10 +22,10 @@ from hypothesis import strategies as st
 from mpcoffline.core.errors import StorageError
 from mpcoffline.datasets import dataset_from_arrays, repair
 from mpcoffline.datasets.record.recording import Recording
-from mpcoffline.datasets.store import writing
+from mpcoffline.datasets.store import hdf5_writing
+from mpcoffline.datasets.store.hdf5_writing import SteadyFile, write_steadily
 from mpcoffline.datasets.store.packed import pack, packed_size
 from mpcoffline.datasets.store.recording_lock import log_files
-from mpcoffline.datasets.store.writing import SteadyFile, write_steadily
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def limit() -> Iterator[Any]:
 def route(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Data sets are made in memory, or (as large ones are) through a file that takes everything."""
     if request.param == "steadily":
-        monkeypatch.setattr(writing, "IN_MEMORY", 0)
+        monkeypatch.setattr(hdf5_writing, "IN_MEMORY", 0)
     return str(request.param)
 
 
@@ -159,7 +159,7 @@ def test_it_reads_back_what_was_written_whatever_the_disk_says(
     real = os.pwrite
     with pytest.MonkeyPatch.context() as patch, SteadyFile(path) as file:
         patch.setattr(os, "pwrite", pwrite)
-        patch.setattr(writing, "WINDOW", window)
+        patch.setattr(hdf5_writing, "WINDOW", window)
         for kind, place, data in steps:
             file.seek(place)
             if kind == "write" and data:
@@ -198,8 +198,8 @@ def test_repair_needs_room_too(limit: Any, store: Path) -> None:
 
 
 def test_both_routes_store_the_same(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for version, limit in enumerate((writing.IN_MEMORY, 2_000, 0)):
-        monkeypatch.setattr(writing, "IN_MEMORY", limit)
+    for version, limit in enumerate((hdf5_writing.IN_MEMORY, 2_000, 0)):
+        monkeypatch.setattr(hdf5_writing, "IN_MEMORY", limit)
         name = f"test/routes-v{version}"
         for first in (0, 5):  # new, then more of it
             more = recording_of(name, "extend" if first else "new")

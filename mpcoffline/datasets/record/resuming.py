@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, StorageError
-from mpcoffline.datasets.store.local import dataset_path, is_local, recording_of
+from mpcoffline.datasets.store.ids import dataset_path, is_local
 from mpcoffline.datasets.store.opening import read_metadata
 from mpcoffline.datasets.store.recording_lock import log_files
+from mpcoffline.datasets.store.writing import recording_of
 
 from .episode_log import LogIndex, scan
-from .log_records import LogHeader
+from .log_format import LogHeader
 
 
 def common_header(indices: list[LogIndex]) -> LogHeader:
