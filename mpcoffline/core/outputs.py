@@ -27,8 +27,8 @@ _UNIQUE = re.compile("[0-9a-f]{12}")
 def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     """A new file that takes its name once it is complete and on the disk; until then, what was there stays.
 
-    A symbolic link stays one: what it points to is replaced. Where the old file may not be written, nothing is. What a
-    killed process has left of the same name goes first.
+    A symbolic link stays one: what it points to is replaced, and keeps its permissions. Where the old file may not be
+    written, nothing is. What a killed process has left of the same name goes first.
 
     Args:
         path: Its name.
@@ -45,10 +45,12 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     try:
         _remove_abandoned(target.parent, begin)
         with _locked(temporary) as file:
+            with suppress(OSError):  # there is none, or its mode cannot be had
+                os.fchmod(file.fileno(), target.stat().st_mode & 0o777)
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, target)
+            os.replace(temporary, target)  # while it is locked: nobody takes it for abandoned
         with suppress(OSError):  # a file system that cannot say so
             sync_folder(target.parent)
     except BaseException as error:
@@ -74,11 +76,12 @@ def _locked(path: Path) -> IO[bytes]:
 def _remove_abandoned(folder: Path, begin: str) -> None:
     """Removes the temporary files that nobody writes any more: the system gives their locks back with their process."""
     with suppress(OSError), os.scandir(folder) as entries:
-        names = [e.name for e in entries if e.name.startswith(begin) and _UNIQUE.fullmatch(e.name[len(begin) :])]
-        for name in names:
-            with suppress(OSError), (folder / name).open("rb") as file:
+        ours = [e for e in entries if e.name.startswith(begin) and _UNIQUE.fullmatch(e.name[len(begin) :])]
+        for path in (entry.path for entry in ours if entry.is_file(follow_symlinks=False)):
+            # Not to wait for a writer, should it have become a FIFO since.
+            with suppress(OSError), open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                (folder / name).unlink()
+                os.unlink(path)
 
 
 def write_file(path: str | PathLike[str], content: bytes | str) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import random
@@ -48,8 +47,6 @@ def all_cases(honest: Honest, share: float) -> list[Case]:
     for kind, count in FULL.items():
         target = next(name for name in readers if kind.startswith(name))
         make = partial(readers[target], honest, kind)
-        if kind.startswith("log salvaged") and "salvage" not in inspect.signature(repair).parameters:
-            continue
         cases += [Case(f"{kind}/{k}", make, needs[target]) for k in range(max(2, round(count * share)))]
     return cases
 

@@ -197,6 +197,22 @@ def test_repair_needs_room_too(limit: Any, store: Path) -> None:
     assert check_survivors(5) == 5
 
 
+@pytest.mark.parametrize("size", [0, 3_000, 20_000])
+def test_a_rebuild_needs_room_too(size: int, limit: Any, store: Path) -> None:
+    recorded = recording()
+    for number in range(20):
+        recorded.append(0, episode(number), complete=True)
+    recorded.seal()
+    (store / DATASET / "data" / "metadata.json").unlink()
+    before = {path: path.read_bytes() for path in files(store) if path.is_file()}
+    limit(size)
+    with pytest.raises(StorageError, match=r"expected to be written, got File too large.*Free some"):
+        repair(DATASET)
+    limit(resource.RLIM_INFINITY)
+    assert {path: path.read_bytes() for path in files(store) if path.is_file()} == before
+    assert repair(DATASET).episodes == 20
+
+
 def test_both_routes_store_the_same(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for version, limit in enumerate((hdf5_writing.IN_MEMORY, 2_000, 0)):
         monkeypatch.setattr(hdf5_writing, "IN_MEMORY", limit)
