@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
+from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.store.local import load_dataset
 
@@ -152,17 +154,11 @@ def replay(
     indices = dataset.episode_indices
     if n_episodes is not None and n_episodes < len(indices):
         indices = indices[np.linspace(0, len(indices) - 1, n_episodes).round().astype(int)]
-    episodes = dataset.iterate_episodes(indices)
-    if progress:
-        from rich.progress import track
-
-        episodes = track(episodes, description="Simulating again", total=len(indices))
     simulation = Simulation(env, dataset)
-    try:
-        for episode in episodes:
+    with closing(env), Bars(progress) as bars:
+        for done, episode in enumerate(dataset.iterate_episodes(indices), start=1):
             simulation.run(episode)
-    finally:
-        env.close()
+            bars.show("Simulating again", done, len(indices))
     return ReplayReport(
         dataset_id=dataset.spec.dataset_id,
         env_id=env.spec.id if env.spec is not None else "",
