@@ -15,6 +15,7 @@ import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.core.progress import Bars
+from mpcoffline.core.tables import Table, verdict
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.store.local import load_dataset
 
@@ -83,15 +84,8 @@ class ReplayReport:
         return visible("\n".join([self.headline, *rows, *self._remarks()]))
 
     def __rich__(self) -> RenderableType:
-        from rich.console import Group
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table("largest deviation", "whole episode", "one step", "tolerance", box=None, pad_edge=False)
-        for row in self._rows():
-            table.add_row(*row)
-        headline = Text(visible(self.headline), style="bold green" if self.ok else "bold red")
-        return Group(headline, table, *(Text(visible(line)) for line in self._remarks()))
+        table = Table(("largest deviation", "whole episode", "one step", "tolerance"), self._rows())
+        return verdict(self.headline, self.ok, table, self._remarks())
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         def cell(deviations: Mapping[str, Deviation], name: str) -> str:
