@@ -19,6 +19,7 @@ from mpcoffline.simulation.closed_loop import Simulation, initial_states, simula
 from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
 
+from .figure import Traces
 from .measures import (
     bound_names,
     fit_errors,
@@ -30,7 +31,7 @@ from .measures import (
     returns_of,
     value_check,
 )
-from .report import PredictionCheck, Report, Traces
+from .report import PredictionCheck, Report
 from .stability import TheoremCheck, closed_loop_eigenvalues, value_growth, weight_checks
 from .verdict import Comparison, decide
 
