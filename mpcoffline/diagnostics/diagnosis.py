@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.smoothing import SmoothedIdentification, identify_smoothed
 from mpcoffline.learner.learner import OfflineMPCLearner
@@ -37,8 +37,6 @@ from .verdict import Comparison, decide
 
 if TYPE_CHECKING:
     from minari import MinariDataset
-
-Array = NDArray[np.float64]
 
 _STARTS = 20
 _FEW_STARTS = 3

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style
 
 from .measures import RegionError, ValueCheck
@@ -16,8 +16,6 @@ from .verdict import Comparison, Verdict
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-Array = NDArray[np.float64]
-
 _HEIGHT = 4.6
 _POINTS = 1_500
 

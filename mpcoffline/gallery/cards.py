@@ -16,8 +16,9 @@ from mpcoffline.core.tables import Table
 from mpcoffline.core.text import markdown
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.envs import LinearTrackingEnv
+from mpcoffline.envs.episode import DISCOUNT, EPISODE_STEPS
 
-from .collection import DISCOUNT, AgentScore, return_curve
+from .collection import AgentScore, return_curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,7 +109,7 @@ def return_figure(costs: NDArray[np.float64], scores: Sequence[AgentScore]) -> F
     else:
         axes.set_ylim(bottom=0.0)
     axes.set_xlim(0, len(costs))
-    axes.set_xlabel("training episode (100 steps)")
+    axes.set_xlabel(f"training episode ({EPISODE_STEPS} steps)")
     axes.set_ylabel("cost $J$ of the episode (= $-$return)")
     axes.grid(which="major", color="0.92", linewidth=0.6)
     axes.set_axisbelow(True)

@@ -23,12 +23,11 @@ from mpcoffline.core.progress import Bars
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.datasets.record.recorder import MinariRecorder
 from mpcoffline.envs import ControlTask
+from mpcoffline.envs.episode import DISCOUNT, EPISODE_STEPS
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-DISCOUNT = 0.9
-EPISODE_STEPS = 100
 FIRST_START = 10_000
 
 
