@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from .base import ControlTask
 from .cartpole_swing_up import CartPoleSwingUpEnv
+from .episode import EPISODE_STEPS
 from .linear_tracking import LinearTrackingEnv
 from .pendulum_swing_up import PendulumSwingUpEnv
 
@@ -24,13 +25,11 @@ _TASKS = {
 #: The tasks with a nominal controller, labels in figures and a shipped data set.
 ENV_IDS = ("mpcoffline/LinearTracking-v0", "mpcoffline/PendulumSwingUp-v0", "mpcoffline/CartPoleSwingUp-v0")
 
-_MAX_EPISODE_STEPS = 100
-
 for _id, _name in _TASKS.items():
     if _id not in gym.registry:
         gym.register(
             _id,
             entry_point=f"mpcoffline.envs.{_name}Env",
             vector_entry_point=f"mpcoffline.envs.{_name}VectorEnv",
-            max_episode_steps=_MAX_EPISODE_STEPS,
+            max_episode_steps=EPISODE_STEPS,
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .arguments import Array, checked_render_mode, floats_of
 from .base import ControlTask, Observation
+from .episode import EPISODE_STEPS
 from .rendering import Frame
 
 Options = dict[str, Any] | Sequence[dict[str, Any]]
@@ -58,7 +59,7 @@ class ControlTaskVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[
     def __init__(
         self,
         num_envs: int = 1,
-        max_episode_steps: int | None = 100,
+        max_episode_steps: int | None = EPISODE_STEPS,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,

@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Iterable
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,8 @@ from rich.segment import Segment
 from typer.core import TyperGroup
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError, visible
+
+from .others import AddedCommand, added_commands
 
 if TYPE_CHECKING:
     from gymnasium import Env
@@ -100,7 +103,24 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, for
 
 
 class ErrorGroup(TyperGroup):
-    """Shows what a user can do something about as one line, without traceback."""
+    """Shows what a user can do something about as one line, without traceback; knows commands of other packages."""
+
+    @cached_property
+    def _added(self) -> dict[str, AddedCommand]:
+        return {name: command for name, command in added_commands().items() if name not in self.commands}
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names of this package's commands, then of others'."""
+        return [*super().list_commands(ctx), *self._added]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of a name; that of another package is not loaded for it."""
+        return super().get_command(ctx, cmd_name) or self._added.get(cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is called."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command.loaded() if isinstance(command, AddedCommand) else command, rest
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """Prints what the terminal's character set lacks by its number."""

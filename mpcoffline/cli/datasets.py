@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
+
+from mpcoffline.core.tables import Table
 
 from .common import Json, check_figure, check_out, console, examples, print_json, say
 
@@ -32,12 +33,8 @@ def list_(as_json: Json = False) -> None:
     if as_json:
         print_json([asdict(row) for row in rows])
         return
-    table = Table(box=None, pad_edge=False)
-    for name in ("id", "where", "episodes", "transitions"):
-        table.add_column(name, justify="right" if name in ("episodes", "transitions") else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(escape(row.id), row.where, str(row.episodes), str(row.steps))
-    console.print(table)
+    cells = [(row.id, row.where, str(row.episodes), str(row.steps)) for row in rows]
+    console.print(Table(("id", "where", "episodes", "transitions"), cells, align="llr"))
 
 
 @app.command(

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.tables import Table
 
 from .common import (
     Alpha,
@@ -177,16 +177,15 @@ def evaluate(
             | {"failures": stats.answers}
         )
         return
-    title = escape(f"{policy.name} in {env}, {episodes} episodes")
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for name in ("", "mean", "best", "worst"):
-        table.add_column(name, justify="right" if name else "left")
-    for label, costs in (("cost J", result.cost), (f"discounted cost ({result.discount:g})", result.discounted_cost)):
-        table.add_row(label, f"{costs.mean():.2f}", f"{costs.min():.2f}", f"{costs.max():.2f}")
-    table.add_row("success", f"{result.success.mean():.0%}")
-    table.add_row("time of a solve (ms)", f"{1e3 * stats.time / stats.n_solves:.2f}")
-    table.add_row("failed solves", stats.failures)
-    console.print(table)
+    costs = ("cost J", result.cost), (f"discounted cost ({result.discount:g})", result.discounted_cost)
+    rows = [
+        *((label, f"{c.mean():.2f}", f"{c.min():.2f}", f"{c.max():.2f}") for label, c in costs),
+        ("success", f"{result.success.mean():.0%}"),
+        ("time of a solve (ms)", f"{1e3 * stats.time / stats.n_solves:.2f}"),
+        ("failed solves", stats.failures),
+    ]
+    title = f"{policy.name} in {env}, {episodes} episodes"
+    console.print(Table(("", "mean", "best", "worst"), rows, title, "lr"))
 
 
 def _loggers(log_csv: Path | None, tensorboard: Path | None) -> list[Callback]:
@@ -254,14 +253,10 @@ def _figures(result: Evaluation) -> dict[str, Any]:
 def _parameter_table(learner: OfflineMPCLearner) -> Table:
     """The parameters before and after learning: numbers, and the diagonals of matrices."""
     before, after = learner.nominal_mpc.values, learner.mpc.values
-    table = Table(title="Parameters (diagonals of matrices)", title_justify="left", box=None, pad_edge=False)
-    for name in ("parameter", "nominal", "learned"):
-        table.add_column(name)
-    for name in dict.fromkeys([*before, *after]):
-        table.add_row(escape(name), *(_shown(values.get(name)) for values in (before, after)))
+    rows = [(name, _shown(before.get(name)), _shown(after.get(name))) for name in dict.fromkeys([*before, *after])]
     if learner.result is not None:
-        table.add_row("regression error", f"{learner.result.loss_before:.4g}", f"{learner.result.loss_after:.4g}")
-    return table
+        rows.append(("regression error", f"{learner.result.loss_before:.4g}", f"{learner.result.loss_after:.4g}"))
+    return Table(("parameter", "nominal", "learned"), rows, "Parameters (diagonals of matrices)")
 
 
 def _shown(value: Any) -> str:

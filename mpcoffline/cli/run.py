@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
+
+from mpcoffline.core.tables import Table
 
 from .common import Alpha, PlantAlpha, Preset, Seed, TaskArgument, ValueForm, console, examples, say, say_file
 
@@ -122,15 +123,12 @@ def collect(
     blocks = min(_BLOCKS, len(returns))
     edges = [round(i * len(returns) / blocks) for i in range(blocks + 1)]
     means = [float(returns[low:high].mean()) for low, high in itertools.pairwise(edges)]
-    table = Table(title="Return curve (mean of the episodes)", title_justify="left", box=None, pad_edge=False)
-    table.add_column("episodes", justify="right")
-    table.add_column("return", justify="right")
-    table.add_column("")
+    rows = []
     worst, best = min(means), max(means)
     for (low, high), mean in zip(itertools.pairwise(edges), means, strict=True):
         share = (mean - worst) / (best - worst) if best > worst else 1.0
-        table.add_row(f"{low + 1}-{high}", f"{mean:.1f}", "█" * (1 + round(29 * share)))
-    console.print(table)
+        rows.append((f"{low + 1}-{high}", f"{mean:.1f}", "█" * (1 + round(29 * share))))
+    console.print(Table(("episodes", "return", ""), rows, "Return curve (mean of the episodes)", "rrl"))
     name = str(dataset.spec.dataset_id)
     say(f"Recorded {dataset.total_steps} transitions as [bold]{escape(name)}[/].")
     say(f"Next: mpcoffline learn --dataset {escape(name)}")

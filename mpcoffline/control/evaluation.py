@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.check.rebuilding import rebuilt_spec, without_window
 from mpcoffline.datasets.record.plants import (
     check_spaces,
@@ -28,9 +29,8 @@ from mpcoffline.datasets.record.plants import (
 from mpcoffline.datasets.record.stage_cost import PlantInfo, number_of, reward_of
 from mpcoffline.datasets.record.watching import PlantWatch, watched
 from mpcoffline.envs import ControlTask
+from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.solvers.fallback import SolverStats, failures_in_words
-
-Array = NDArray[np.float64]
 
 
 class Predictor(Protocol):
@@ -88,7 +88,7 @@ def evaluate(
     n_episodes: int = 20,
     seed: int = 0,
     *,
-    discount: float = 0.9,
+    discount: float = DISCOUNT,
     options: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
     cost_key: str | None = None,
     max_episode_steps: int | None = None,

@@ -8,11 +8,11 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.outputs import check_output_folder, write_file
 from mpcoffline.core.text import c_comment, c_identifiers
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import DDPSolver, starts
 from mpcoffline.solvers.ddp.codegen import generated, text
@@ -24,9 +24,10 @@ _log = logging.getLogger(__name__)
 _FILES = ("mpc_controller.h", "mpc_controller.c", "mpc_test.c", "test_vectors.txt", "CMakeLists.txt")
 _EPISODES, _STEPS = 4, 20
 # How a start of the test vectors is chosen, see _unambiguous_starts.
-_DRAWS = 40
-_NEARBY, _NEIGHBOURS = 0.05, 32  # how far from a start its neighbours are, and how many
-_ALIKE = 1e-3  # costs that differ by less, relative to 1 + |J|, are almost as good
+_SIZES = (1.0, 1e-3, 1e-6, 1e-9)  # of what is reached: bounds may be so wide that they say nothing
+_DRAWS = 10  # of each size
+_NEARBY, _NEIGHBOURS = 0.05, 32  # how far from a start its neighbours are, in widths of what is reached; how many
+_ALIKE = 1e-3  # costs that differ by less, relative to how much those of the draws do, are almost as good
 _SAME_PLAN = 1e-3  # inputs that differ by less, relative to their range, are one plan: a minimum can be flat
 
 
@@ -135,12 +136,13 @@ def _vectors(policy: MPCPolicy) -> list[list[float]]:
             y = mpc.model(y, solution.u0)
     if not rows:
         _log.warning(
-            "No test vectors: of %d starts each was unsolved or had plans that are as good as its own.", _DRAWS
+            "No test vectors: of %d starts each was unsolved or had plans that are as good as its own.",
+            _DRAWS * len(_SIZES),
         )
     return rows
 
 
-def _ranges(mpc: MPC, rows: list[list[float]]) -> NDArray[np.float64]:
+def _ranges(mpc: MPC, rows: list[list[float]]) -> Array:
     """The range of each input that errors are measured by: never so large that no input at all would pass."""
     width = np.asarray(mpc.action_high) - np.asarray(mpc.action_low)
     largest = np.abs(np.array([row[-mpc.nu :] for row in rows])).max(axis=0) if rows else np.zeros(mpc.nu)
@@ -148,29 +150,45 @@ def _ranges(mpc: MPC, rows: list[list[float]]) -> NDArray[np.float64]:
     return np.where(ranges > 0.0, ranges, np.where(np.isfinite(width), width, 1.0))
 
 
-def _unambiguous_starts(policy: MPCPolicy) -> list[NDArray[np.float64]]:
+def _unambiguous_starts(policy: MPCPolicy) -> list[Array]:
     """States with one best plan: no plan of a state nearby leads to another minimum that is almost as good.
 
     Python drops a start that is nearly beaten, C has no rivals to compare it with, and rounding differs too: which of
     two minima alike is found would say nothing of the code.
     """
     rng, shaking = np.random.default_rng(0), np.random.default_rng(1)
-    found: list[NDArray[np.float64]] = []
+    found: list[Array] = []
     width = np.asarray(policy.mpc.action_high) - np.asarray(policy.mpc.action_low)
-    for _ in range(_DRAWS):
-        y = rng.uniform(-1.0, 1.0, policy.mpc.nx)
-        nearby = y + _NEARBY * shaking.uniform(-1.0, 1.0, (_NEIGHBOURS, len(y)))
-        own = policy.solver.solve(y)
-        size = np.abs(own.u).max()
-        others = policy.solver.solve(np.tile(y, (_NEIGHBOURS, 1)), warm_start=policy.solver.solve(nearby).plan)
-        rivals = others.u[others.value < own.value + _ALIKE * (1.0 + abs(own.value))]
-        if own.success and np.all(
-            np.abs(rivals - own.u) < _SAME_PLAN * np.where(np.isfinite(width), width, 1.0 + size)
-        ):
-            found.append(y)
-        if len(found) == _EPISODES:
-            break
+    centre, low, high = _reached(policy.mpc)
+    for size in _SIZES:
+        draws = centre + size * (rng.uniform(low, high, (_DRAWS, policy.mpc.nx)) - centre)
+        solved = policy.solver.solve(draws)
+        alike = _ALIKE * float(np.ptp(solved.value[solved.success])) if solved.success.any() else 0.0
+        for y, plan, value in zip(*(a[solved.success] for a in (draws, solved.u, solved.value)), strict=True):
+            nearby = y + size * _NEARBY * (high - low) * shaking.uniform(-0.5, 0.5, (_NEIGHBOURS, len(y)))
+            others = policy.solver.solve(np.tile(y, (_NEIGHBOURS, 1)), warm_start=policy.solver.solve(nearby).plan)
+            rivals = others.u[others.value < value + alike]
+            same = _SAME_PLAN * np.where(np.isfinite(width), width, np.abs(plan).max())
+            if np.all(np.abs(rivals - plan) < same):
+                found.append(y)
+            if len(found) == _EPISODES:
+                return found
     return found
+
+
+def _reached(mpc: MPC) -> tuple[Array, Array, Array]:
+    """The reference (zero without one), and between which states the starts are: where the inputs take the model.
+
+    That is the middle half of what an episode reaches from there, widened to twice its size; so it is in the plant's
+    own units.
+    """
+    inputs, centre = starts.candidate_inputs(mpc), np.zeros(mpc.nx) if mpc.reference is None else mpc.reference
+    states = [np.broadcast_to(centre, (len(inputs), mpc.nx))]
+    for k in range(min(_STEPS, mpc.horizon)):
+        states.append(mpc.model(states[-1], inputs[:, k]))
+    reached = np.concatenate(states)
+    low, high = np.quantile(reached[np.isfinite(reached).all(axis=1)], [0.25, 0.75], axis=0)
+    return centre, low - (high - low) / 2, high + (high - low) / 2
 
 
 def _number(value: float) -> str:

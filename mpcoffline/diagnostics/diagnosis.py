@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.smoothing import SmoothedIdentification, identify_smoothed
 from mpcoffline.learner.learner import OfflineMPCLearner
@@ -19,6 +19,7 @@ from mpcoffline.simulation.closed_loop import Simulation, initial_states, simula
 from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
 
+from .figure import Traces
 from .measures import (
     bound_names,
     fit_errors,
@@ -30,14 +31,12 @@ from .measures import (
     returns_of,
     value_check,
 )
-from .report import PredictionCheck, Report, Traces
+from .report import PredictionCheck, Report
 from .stability import TheoremCheck, closed_loop_eigenvalues, value_growth, weight_checks
 from .verdict import Comparison, decide
 
 if TYPE_CHECKING:
     from minari import MinariDataset
-
-Array = NDArray[np.float64]
 
 _STARTS = 20
 _FEW_STARTS = 3

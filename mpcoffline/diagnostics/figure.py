@@ -2,42 +2,66 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpcoffline.core.types import Array
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style
+
+from .measures import RegionError, ValueCheck
+from .verdict import Comparison, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from .report import Report
-
 _HEIGHT = 4.6
 _POINTS = 1_500
 
 
-def draw(report: Report) -> Figure:
+@dataclass(frozen=True)
+class Traces:
+    """What the figure shows besides.
+
+    Attributes:
+        nominal_states: MPC_1 on the identified model, ``(starts, T + 1, nx)``.
+        learned_states: The learned MPC, likewise.
+        value: V of some logged states and the return measured from each, ``(2, n)``.
+        goal: The reference, ``(nx,)``, where there is one.
+    """
+
+    nominal_states: Array = field(repr=False)
+    learned_states: Array = field(repr=False)
+    value: Array = field(repr=False)
+    goal: Array | None = field(repr=False)
+
+
+def draw(
+    verdict: Verdict, comparison: Comparison, value: ValueCheck, fit: tuple[RegionError, ...], traces: Traces
+) -> Figure:
     """Draws relative costs on the models, closed loops, V against returns, and the error of (FIT).
 
     Args:
-        report: What to draw.
+        verdict: What the report says.
+        comparison: Both controllers on the ensemble.
+        value: V_phi against measured returns.
+        fit: The error of (FIT) by region.
+        traces: What is not in the report's text.
     """
     with paper_style():
         figure = new_figure(PAGE_WIDTH, _HEIGHT)
         axes = figure.subplots(2, 2)
-        figure.suptitle(f"Verdict: {report.verdict}", fontsize=10, fontweight="bold", x=0.01, ha="left")
-        _draw_ratios(axes[0, 0], report)
-        _draw_distances(axes[0, 1], report)
-        _draw_value(axes[1, 0], report)
-        _draw_fit(axes[1, 1], report)
+        figure.suptitle(f"Verdict: {verdict}", fontsize=10, fontweight="bold", x=0.01, ha="left")
+        _draw_ratios(axes[0, 0], comparison)
+        _draw_distances(axes[0, 1], traces)
+        _draw_value(axes[1, 0], value, traces)
+        _draw_fit(axes[1, 1], fit)
     return figure
 
 
-def _draw_ratios(axes: Axes, report: Report) -> None:
+def _draw_ratios(axes: Axes, c: Comparison) -> None:
     """One dot a model: the learned controller's cost over that of MPC_1."""
-    c = report.comparison
     n_residual = (len(c.ratios) - 1) // 2
     kinds = ["identified"] + ["parameters varied"] * (len(c.ratios) - 1 - n_residual) + ["with residual"] * n_residual
     colors = {"identified": "#000000", "parameters varied": STYLES["MPC_3"].color, "with residual": "#009E73"}
@@ -67,9 +91,8 @@ def _draw_ratios(axes: Axes, report: Report) -> None:
     axes.legend(loc="lower left", ncols=3, fontsize=7, handletextpad=0.2, columnspacing=0.8)
 
 
-def _draw_distances(axes: Axes, report: Report) -> None:
+def _draw_distances(axes: Axes, traces: Traces) -> None:
     """How far both controllers are from where they end, over the steps: median and quartiles over the starts."""
-    traces = report.traces
     everything = np.concatenate([traces.nominal_states, traces.learned_states]).reshape(
         -1, traces.learned_states.shape[2]
     )
@@ -98,11 +121,11 @@ def _draw_distances(axes: Axes, report: Report) -> None:
     axes.legend(loc="upper right", ncols=2, fontsize=7)
 
 
-def _draw_value(axes: Axes, report: Report) -> None:
+def _draw_value(axes: Axes, value: ValueCheck, traces: Traces) -> None:
     """V against measured returns."""
     axes.set_title("V of the last episodes", loc="left")
-    predicted, measured = report.traces.value
-    if not report.value.n:
+    predicted, measured = traces.value
+    if not value.n:
         axes.text(0.5, 0.5, "no episode is long enough\nfor a measured return", ha="center", va="center")
         axes.set_axis_off()
         return
@@ -120,13 +143,13 @@ def _draw_value(axes: Axes, report: Report) -> None:
     axes.set_ylabel("V")
 
 
-def _draw_fit(axes: Axes, report: Report) -> None:
+def _draw_fit(axes: Axes, fit: tuple[RegionError, ...]) -> None:
     """The error of (FIT) before and after, by region."""
-    names = [part.name.replace("V ", "").replace(" quarter", "") for part in report.fit]
+    names = [part.name.replace("V ", "").replace(" quarter", "") for part in fit]
     places, width = np.arange(len(names)), 0.38
     for offset, label, values, color in (
-        (-0.5, "MPC$_{1}$", [part.before for part in report.fit], STYLES["MPC_1"].color),
-        (0.5, "learned", [part.after for part in report.fit], STYLES["MPC_3"].color),
+        (-0.5, "MPC$_{1}$", [part.before for part in fit], STYLES["MPC_1"].color),
+        (0.5, "learned", [part.after for part in fit], STYLES["MPC_3"].color),
     ):
         axes.bar(places + offset * width, np.maximum(values, 1e-12), 0.92 * width, color=color, label=label)
     axes.set_yscale("log")
@@ -137,4 +160,4 @@ def _draw_fit(axes: Axes, report: Report) -> None:
     axes.set_ylabel("mean square / variance of the cost")
     axes.set_title("Error of (FIT)", loc="left")
     axes.legend(loc="upper left", ncols=2, fontsize=7)
-    axes.set_ylim(top=10.0 * max(max(part.before, part.after) for part in report.fit))
+    axes.set_ylim(top=10.0 * max(max(part.before, part.after) for part in fit))

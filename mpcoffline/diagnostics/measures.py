@@ -8,16 +8,14 @@ import numpy as np
 import scipy.spatial
 import scipy.stats
 import torch
-from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.learning.bellman.equation import BellmanFit, variance_of
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.features import RandomFeatures, Ridge
-
-Array = NDArray[np.float64]
 
 _ROWS = 10_000
 _TREE_ROWS = 5_000

@@ -10,19 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.core.archive import plain
 from mpcoffline.estimation.smoothing import NoiseEstimate
+from mpcoffline.plotting import save_figure
 
+from .figure import Traces, draw
 from .measures import LagCheck, RegionError, ValueCheck
 from .stability import TheoremCheck, WeightCheck
 from .verdict import Comparison, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 _WIDTH = 84  # of the text
 
@@ -42,23 +41,6 @@ class PredictionCheck:
     identified: float
     learned: float
     undetermined: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Traces:
-    """What the figure shows besides.
-
-    Attributes:
-        nominal_states: MPC_1 on the identified model, ``(starts, T + 1, nx)``.
-        learned_states: The learned MPC, likewise.
-        value: V of some logged states and the return measured from each, ``(2, n)``.
-        goal: The reference, ``(nx,)``, where there is one.
-    """
-
-    nominal_states: Array = field(repr=False)
-    learned_states: Array = field(repr=False)
-    value: Array = field(repr=False)
-    goal: Array | None = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -160,9 +142,7 @@ class Report:
         Returns:
             The figure; a notebook shows it.
         """
-        from .figure import draw
-
-        return draw(self)
+        return draw(self.verdict, self.comparison, self.value, self.fit, self.traces)
 
     def figure(self, path: str | PathLike[str]) -> list[Path]:
         """Writes :meth:`plot`.
@@ -173,8 +153,6 @@ class Report:
         Returns:
             The files.
         """
-        from mpcoffline.plotting import save_figure
-
         return save_figure(self.plot(), Path(path))
 
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC, QuadraticCost
 from mpcoffline.solvers import Solver
-
-Array = NDArray[np.float64]
 
 _NEIGHBOURS = 100
 _FLAT = 0.05  # of the widest: a direction in which the neighbours of the reference vary less is no direction of motion

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.closed_loop import Simulation
 
 from .measures import LagCheck
-
-Array = NDArray[np.float64]
 
 Verdict = Literal["recommend", "try with care", "keep MPC_1"]
 

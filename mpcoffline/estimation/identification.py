@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidDataError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
 
 from .one_step import OneStep
-
-Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

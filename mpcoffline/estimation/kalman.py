@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from mpcoffline.core.types import Array
 
 _UNMEASURED = 1e12  # variance of a measurement that does not exist
 

@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
-
-Array = NDArray[np.float64]
 
 
 class OneStep:

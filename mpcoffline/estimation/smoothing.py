@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
 from .identification import Identification, IdentificationConfig, OneStepProblem, described, identify
 from .kalman import Filtered, Linearised, filtered, smoothed
 from .trajectories import Trajectories
-
-Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

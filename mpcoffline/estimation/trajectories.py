@@ -8,14 +8,13 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
 from .identification import Rows
 from .kalman import Linearised
 from .one_step import OneStep
-
-Array = NDArray[np.float64]
 
 _LENGTHS = (200, 100, 50, 25, 12)  # steps that a trajectory may have; longer ones are cut and filtered side by side
 _CUT = 1e-3  # share of the pairs of measurements of one state that may be taken for a gap

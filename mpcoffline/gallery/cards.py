@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.outputs import write_file
+from mpcoffline.core.tables import Table
 from mpcoffline.core.text import markdown
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.envs import LinearTrackingEnv
+from mpcoffline.envs.episode import DISCOUNT, EPISODE_STEPS
 
-from .collection import DISCOUNT, AgentScore, return_curve
+from .collection import AgentScore, return_curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,7 +109,7 @@ def return_figure(costs: NDArray[np.float64], scores: Sequence[AgentScore]) -> F
     else:
         axes.set_ylim(bottom=0.0)
     axes.set_xlim(0, len(costs))
-    axes.set_xlabel("training episode (100 steps)")
+    axes.set_xlabel(f"training episode ({EPISODE_STEPS} steps)")
     axes.set_ylabel("cost $J$ of the episode (= $-$return)")
     axes.grid(which="major", color="0.92", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -198,7 +200,13 @@ def _card_text(
     last = costs[-50:]
     extent = np.percentile(np.abs(states), [50, 90, 99, 100], axis=0)
     saturated = float(np.mean(np.abs(actions) >= 0.999 * np.abs(actions).max()))
-    coordinates = [f"s[{i}]" for i in range(states.shape[1])]
+    covered = [
+        ("episodes x steps", f"{len(costs)} x {len(states) // len(costs)}"),
+        ("J of an episode: median, worst", f"{np.median(costs):.1f}, {costs.max():.1f}"),
+        ("J of the last 50 episodes: mean", f"{last.mean():.1f}"),
+        ("actions at a bound", f"{saturated:.0%}"),
+    ]
+    sizes = [(f"s[{i}]", *(f"{value:.3g}" for value in column)) for i, column in enumerate(extent.T)]
     parts = [
         f"# {recipe.dataset_id}",
         markdown(recipe.description)
@@ -209,46 +217,29 @@ def _card_text(
         "## How it was made",
         f"`scripts/make_datasets {recipe.task}` repeats it from `{recipe.task}.toml`: the agent starts untrained, and"
         " every transition of its training is kept, exploration included.",
-        _table(("setting", "value"), list(settings.items())),
+        Table(("setting", "value"), list(settings.items())).markdown(str),
         "## How well the agent learned",
         f"The final agent, without exploration noise, from fresh starts; J is the summed cost of 100 steps, Jd the"
         f" cost discounted with {DISCOUNT:g}.",
-        _table(
-            ("starts", "episodes", "J", "worst J", "Jd", "success"),
-            [
-                (
-                    s.start,
-                    s.episodes,
-                    f"{s.cost:.1f}",
-                    f"{s.worst_cost:.1f}",
-                    f"{s.discounted_cost:.2f}",
-                    f"{s.success:.0%}",
-                )
-                for s in scores
-            ],
-        ),
+        Table(
+            ("starts", "episodes", "J", "worst J", "Jd", "success"), [_figures(score) for score in scores]
+        ).markdown(),
         *_optimum(recipe, scores),
         f"![Cost of each training episode]({recipe.task}_returns.png)",
         "## What it covers",
-        _table(
-            ("", "value"),
-            [
-                ("episodes x steps", f"{len(costs)} x {len(states) // len(costs)}"),
-                ("J of an episode: median, worst", f"{np.median(costs):.1f}, {costs.max():.1f}"),
-                ("J of the last 50 episodes: mean", f"{last.mean():.1f}"),
-                ("actions at a bound", f"{saturated:.0%}"),
-            ],
-        ),
-        _table(
-            ("size of", "median", "90 %", "99 %", "largest"),
-            [(name, *(f"{value:.3g}" for value in column)) for name, column in zip(coordinates, extent.T, strict=True)],
-        ),
+        Table(("", "value"), covered).markdown(str),
+        Table(("size of", "median", "90 %", "99 %", "largest"), sizes).markdown(str),
         f"![State-action coverage]({recipe.task}_coverage.png)",
         "## Licence and source",
         "MIT, like the package. The task and the idea of learning an MPC from such data are those of Sawant, Anand,"
         ' Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.',
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _figures(score: AgentScore) -> tuple[str, ...]:
+    costs = f"{score.cost:.1f}", f"{score.worst_cost:.1f}", f"{score.discounted_cost:.2f}"
+    return score.start, str(score.episodes), *costs, f"{score.success:.0%}"
 
 
 def _optimum(recipe: Recipe, scores: Sequence[AgentScore]) -> list[str]:
@@ -269,8 +260,3 @@ def _optimum(recipe: Recipe, scores: Sequence[AgentScore]) -> list[str]:
         f"The optimum without input bounds (discounted Riccati equation) is Jd = {best:.2f} on these starts: the agent"
         f" reaches {best / scores[0].discounted_cost:.3f} of it."
     ]
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -20,15 +19,15 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.progress import Bars
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.datasets.record.recorder import MinariRecorder
 from mpcoffline.envs import ControlTask
+from mpcoffline.envs.episode import DISCOUNT, EPISODE_STEPS
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-DISCOUNT = 0.9
-EPISODE_STEPS = 100
 FIRST_START = 10_000
 
 
@@ -76,12 +75,10 @@ def collect_with(recipe: Recipe, *, overwrite: bool = False, progress: bool = Tr
         InvalidArgumentError: For an id that is malformed or exists.
     """
     recorder = _RecipeRecorder(recipe, overwrite)
-    bar = _ProgressBar(recipe.steps, recorder, f"{recipe.algorithm} learns {recipe.task}") if progress else None
-    callbacks: list[BaseCallback] = [recorder, _StopAt(recipe.steps), *([bar] if bar else [])]
     # Two small networks: threads only get in each other's way.
-    with _torch_threads(1), bar.shown() if bar else nullcontext(), closing(recorder):
+    with _torch_threads(1), Bars(progress) as bars, closing(recorder):
         agent = make_agent(recipe)
-        agent.learn(recipe.steps, callback=callbacks)
+        agent.learn(recipe.steps, callback=[recorder, _StopAt(recipe.steps), _ShownReturns(bars, recipe, recorder)])
     if recorder.dataset is None:
         raise InvalidArgumentError("training", expected="to run to its end", actual="no recorded data set")
     return recorder.dataset, agent
@@ -236,41 +233,18 @@ class _StopAt(BaseCallback):
         return self.num_timesteps < self._steps
 
 
-class _ProgressBar(BaseCallback):
-    """A rich progress bar with the mean return of the last episodes."""
+class _ShownReturns(BaseCallback):
+    """Moves a bar, with the mean return of the last episodes."""
 
-    def __init__(self, steps: int, recorder: MinariRecorder, title: str, window: int = 20) -> None:
+    def __init__(self, bars: Bars, recipe: Recipe, recorder: MinariRecorder, window: int = 20) -> None:
         super().__init__()
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._steps, self._title = steps, title
-        self._recorder = recorder
-        self._counted = 0
-        self._returns: deque[float] = deque(maxlen=window)
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("return {task.fields[mean]}"),
-            TimeRemainingColumn(),
-        )
-
-    @contextmanager
-    def shown(self) -> Iterator[None]:
-        """Shows the bar, and gives the terminal back however the training ends."""
-        with self._bar:
-            yield
-
-    def _on_training_start(self) -> None:
-        self._task = self._bar.add_task(self._title, total=self._steps, mean="-")
+        self._bars, self._recorder, self._window = bars, recorder, window
+        self._title, self._steps = f"{recipe.algorithm} learns {recipe.task}", recipe.steps
 
     def _on_step(self) -> bool:
-        if any(self.locals["dones"]):
-            returns = self._recorder.returns
-            self._returns.extend(returns[self._counted :])
-            self._counted = len(returns)
-        mean = f"{np.mean(self._returns):.1f}" if self._returns else "-"
-        self._bar.update(self._task, completed=min(self.num_timesteps, self._steps), mean=mean)
+        returns = self._recorder.returns[-self._window :]
+        text = f"return {np.mean(returns):.1f}" if len(returns) else ""
+        self._bars.show(self._title, min(self.num_timesteps, self._steps), self._steps, text)
         return True
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.outputs import check_output, write_file
-from mpcoffline.core.text import markdown, visible
+from mpcoffline.core.tables import Table
+from mpcoffline.core.text import markdown
 from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.recipes import catalog_file
 from mpcoffline.datasets.store.local import shipped_datasets
@@ -69,31 +70,21 @@ class Summary:
 
     def __str__(self) -> str:
         facts = [f"* {key}: {markdown(value)}" for key, value in self.facts.items()]
-        rows = [_HEADER, ("---",) * len(_HEADER), *self._rows()]
-        table = ["| " + " | ".join(row) + " |" for row in rows]
-        lines = [self.card or f"# {markdown(self.dataset_id)}\n", *facts, "", *table]
+        lines = [self.card or f"# {markdown(self.dataset_id)}\n", *facts, "", self._table().markdown()]
         return "\n".join([*lines, "", f"coverage: {self.figure}"] if self.figure is not None else lines)
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group
         from rich.markdown import Markdown
-        from rich.table import Table
         from rich.text import Text
 
-        facts = Table(box=None, show_header=False, pad_edge=False)
-        for key, value in self.facts.items():
-            facts.add_row(Text(key, style="bold"), Text(visible(value)))
-        table = Table(*_HEADER, box=None, pad_edge=False)
-        for column in table.columns[1:]:
-            column.justify = "right"
-        for row in self._rows():
-            table.add_row(*row)
         head: RenderableType = Markdown(self.card) if self.card else Text(self.dataset_id, style="bold")
         tail = [Text(f"coverage: {self.figure}")] if self.figure is not None else []
-        return Group(head, Text(), facts, Text(), table, Text(), *tail)
+        return Group(head, Text(), Table((), [*self.facts.items()]), Text(), self._table(), Text(), *tail)
 
-    def _rows(self) -> list[tuple[str, ...]]:
-        return [(s.name, *(f"{value:.4g}" for value in (*s.quantiles, s.mean))) for s in self.statistics]
+    def _table(self) -> Table:
+        rows = [(s.name, *(f"{value:.4g}" for value in (*s.quantiles, s.mean))) for s in self.statistics]
+        return Table(_HEADER, rows, align="lr")
 
 
 def show(dataset: MinariDataset | str, figure: str | Path | None = None) -> Summary:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,13 +15,14 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
 from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.mpc import MPC
 
 from .checkpoint import Checkpoint, History, history_from_json
-from .fitting import Epoch, Fit
+from .fitting import Fit
 from .presets import PRESETS, LearnerConfig
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ Learn = Literal["cost", "cost+model"]
 #: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
 Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
 #: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
-#: ends the fit there.
+#: ends the fit there. One with a method ``on_fit_end()`` has it called when the fit ends, for whatever reason.
 Callback = Callable[["OfflineMPCLearner", int, int], Any]
 
 _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
@@ -131,8 +133,9 @@ class OfflineMPCLearner:
             evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
                 one of (FIT) on, when there is a policy: the one that would be handed out if the fit ended there.
             callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch; one that returns
-                False, also numpy's or torch's, ends the fit. :mod:`mpcoffline.learner.loggers` has those that write CSV
-                files and TensorBoard events, :mod:`mpcoffline.sb3` one that runs SB3's.
+                False, also numpy's or torch's, ends the fit. Where one has a method ``on_fit_end()``, it is called when
+                the fit ends, for whatever reason. :mod:`mpcoffline.learner.loggers` has those that write CSV files and
+                TensorBoard events, :mod:`mpcoffline.sb3` one that runs SB3's.
             checkpoint: A file that is written at the end of each epoch. Where it exists, the fit goes on from it and
                 ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
@@ -190,7 +193,10 @@ class OfflineMPCLearner:
         )
         saved = None if checkpoint is None else Checkpoint(checkpoint, fit.identity)
         history: History = [] if saved is None else saved.resume(fit)
-        with _Progress(show_progress) as progress:
+        with ExitStack() as ending, Bars(show_progress) as bars:
+            for callback in callbacks:
+                if (end := getattr(callback, "on_fit_end", None)) is not None:
+                    ending.callback(end)
             for epoch in fit.epochs(**lengths):
                 self.value_function, self.result = fit.value_function, fit.result
                 self._mpc, self._policy, self._observation_space = fit.learned, None, observation_space
@@ -202,7 +208,8 @@ class OfflineMPCLearner:
                 if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
                     saved.write(fit, history)
                 answers = [callback(self, len(history), epoch.total_step) for callback in callbacks]
-                progress.show(epoch)
+                shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
+                bars.show(epoch.phase, epoch.step, epoch.n_steps, shown)
                 yield history[-1]
                 if any(_asks_to_end(answer) for answer in answers):
                     self._mpc = self._found()  # which lets go of the data
@@ -306,33 +313,3 @@ def _asks_to_end(answer: Any) -> bool:
         return answer is not None and not answer
     except (ValueError, RuntimeError):  # numpy's and torch's arrays of several
         return False
-
-
-class _Progress:
-    """A progress bar over the phases of a fit."""
-
-    def __init__(self, show: bool) -> None:
-        from rich.progress import Progress
-
-        self._bar = Progress(disable=not show, transient=False)
-        self._tasks: dict[str, Any] = {}
-
-    def __enter__(self) -> _Progress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if not self._bar.disable:  # rich before 14.3 prints an empty line even so
-            self._bar.stop()
-
-    def show(self, epoch: Epoch) -> None:
-        """Moves the bar of the epoch's phase."""
-        if epoch.phase not in self._tasks:
-            self._tasks[epoch.phase] = self._bar.add_task(epoch.phase)
-        shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
-        self._bar.update(
-            self._tasks[epoch.phase],
-            completed=epoch.step,
-            total=epoch.n_steps,
-            description=f"{epoch.phase}: {shown}",
-        )

@@ -13,9 +13,8 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs import cartpole_swing_up as cartpole
 from mpcoffline.envs import linear_tracking as linear
 from mpcoffline.envs import pendulum_swing_up as pendulum
+from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
-
-DISCOUNT = 0.9
 
 
 class PhysicalParameter(NamedTuple):

@@ -10,11 +10,12 @@ import gymnasium as gym
 import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
 from .panels import TaskLabels, on_plane, task_of
 from .portrait import draw_levels, label_plane
-from .style import PAGE_WIDTH, Array, controller_label, new_figure, paper_style
+from .style import PAGE_WIDTH, controller_label, new_figure, paper_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.envs import ControlTask
-
-from .style import Array
 
 #: Horizontal coordinate, vertical coordinate and values on a grid, each ``(n, n)``.
 Landscape = tuple[Array, Array, Array]

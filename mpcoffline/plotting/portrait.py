@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from mpcoffline.core.types import Array
+
 from .panels import Coordinate, Landscape, TaskLabels, in_pi, on_plane, task_of, unwrapped
-from .style import OTHER, PAGE_WIDTH, STYLES, Array, legend_handles, line_of, new_figure, paper_style
+from .style import OTHER, PAGE_WIDTH, STYLES, legend_handles, line_of, new_figure, paper_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpcoffline.core.types import Array
+
 from .panels import in_pi, unwrapped
-from .style import BOUND, OTHER, STYLES, Array, controller_label, line_of
+from .style import BOUND, OTHER, STYLES, controller_label, line_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

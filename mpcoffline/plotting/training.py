@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.core.types import Array
 
-from .style import PAGE_WIDTH, STYLES, Array, new_figure, paper_style
+from .style import PAGE_WIDTH, STYLES, new_figure, paper_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -293,7 +293,7 @@ class SB3Callback:
         self._model: MPCModel | None = None
 
     def __call__(self, learner: OfflineMPCLearner, epoch: int, total_step: int) -> bool:
-        """Steps the callback, at the end of the fit also ends it; False asks to end the fit."""
+        """Steps the callback; False asks to end the fit."""
         try:
             policy = learner.policy
         except MPCOfflineError:  # (VALUE) goes before
@@ -305,10 +305,13 @@ class SB3Callback:
         go_on = bool(self._callback.on_step())
         if not go_on:
             _log.info("%s ends the fit after epoch %d", type(self._callback).__name__, epoch)
-        if learner.result is not None or not go_on:
-            self._callback.on_training_end()
-            self._model = None  # another fit starts it anew
         return go_on
+
+    def on_fit_end(self) -> None:
+        """Ends the callback, where it has begun; another fit starts it anew."""
+        if self._model is not None:
+            self._model = None
+            self._callback.on_training_end()
 
     def _started(self, learner: OfflineMPCLearner, policy: MPCPolicy) -> MPCModel:
         model = MPCModel(policy, self._env)

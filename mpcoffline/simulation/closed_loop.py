@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 from .ensemble import Ensemble
 from .logged_cost import LoggedCost
-
-Array = NDArray[np.float64]
 
 _RUN_AWAY = 30.0  # spreads of the data: a state this far out has left what any model of them knows
 _END = 0.1  # share of the steps at the end by which success is judged

@@ -6,16 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.identification import Identification, OneStepProblem, Rows, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
 from .features import RandomFeatures, Ridge
-
-Array = NDArray[np.float64]
 
 _BOOTSTRAP_ROWS = 3_000
 _N_FEATURES = 100

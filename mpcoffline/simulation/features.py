@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from mpcoffline.core.types import Array
 
 _RIDGE = 1e-7  # relative to the mean square of the features
 

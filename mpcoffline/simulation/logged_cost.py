@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 from .features import RandomFeatures, Ridge
-
-Array = NDArray[np.float64]
 
 _ROWS = 20_000
 _N_FEATURES = 400

@@ -17,6 +17,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.datasets import load_dataset
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.estimation.smoothing import with_measurement_noise
 from mpcoffline.gallery.collection import starting_states
 from mpcoffline.learner.learner import Learn, OfflineMPCLearner
@@ -110,7 +111,7 @@ class _Arena:
         observations, actions = (cast("spaces.Box", s) for s in (env.observation_space, env.action_space))
         policy = MPCPolicy(mpc, observation_space=observations, action_space=actions)
         options = [{"start": start} for start in self.starts]
-        loop = evaluate(policy, env, self.n_episodes, FIRST_START, discount=0.9, options=options)
+        loop = evaluate(policy, env, self.n_episodes, FIRST_START, discount=DISCOUNT, options=options)
         self.actions.append(np.stack(loop.actions))
         failures = policy.solver_stats.n_failures
         return self._row(name, loop.cost.mean(), loop.discounted_cost.mean(), loop.success.mean(), failures, fit_time)
@@ -118,7 +119,7 @@ class _Arena:
     def best_known(self) -> Row:
         """The best costs of whole episodes, from the actions of the controllers that ran here among others."""
         states = starting_states(self.setup.make_env(), self.starts, FIRST_START)
-        costs = [best_known_costs(self.group.task, states, self.actions, gamma).mean() for gamma in (1.0, 0.9)]
+        costs = [best_known_costs(self.group.task, states, self.actions, gamma).mean() for gamma in (1.0, DISCOUNT)]
         return self._row("best known", *costs, None)
 
     def _row(self, name: str, cost: float, discounted: float, up: float | None, *rest: Any) -> Row:

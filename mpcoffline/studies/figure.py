@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from mpcoffline.core.types import Array
 from mpcoffline.plotting import (
     PAGE_WIDTH,
-    Array,
     Signal,
     draw_bars,
     draw_signal,

@@ -8,18 +8,15 @@ from typing import Any, NamedTuple
 import casadi as ca
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.envs import cartpole_swing_up as cartpole
 from mpcoffline.envs import pendulum_swing_up as pendulum
+from mpcoffline.envs.episode import EPISODE_STEPS
 from mpcoffline.mpc import MPC, LiftedCost, Model, QuadraticCost
 from mpcoffline.solvers import make_solver
 from mpcoffline.solvers.interface import Plan
-
-Array = NDArray[np.float64]
-
-EPISODE = 100  # steps
 
 
 class _SwingUp(NamedTuple):
@@ -99,7 +96,7 @@ def _episode(swing_up: _SwingUp, discount: float) -> MPC:
         model=Model(swing_up.ode, n, 1, swing_up.dt),
         stage_cost=LiftedCost(wrapped, np.zeros(n), np.diag(swing_up.weights), [[_ACTION_WEIGHT]]),
         terminal_cost=QuadraticCost(np.zeros((n, n))),
-        horizon=EPISODE,
+        horizon=EPISODE_STEPS,
         discount=discount,
         action_low=[-swing_up.bound],
         action_high=[swing_up.bound],

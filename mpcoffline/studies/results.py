@@ -7,17 +7,15 @@ import io
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mpcoffline.core.archive import file_errors
 from mpcoffline.core.documents import read_json
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.outputs import write_file
+from mpcoffline.core.tables import Table
 from mpcoffline.core.text import markdown, markdown_code
 from mpcoffline.solvers.fallback import failures_in_words
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 _FORMAT = "mpcoffline main job"
 _VERSION = 1
@@ -169,30 +167,16 @@ class TaskResult:
         return lines
 
     def table(self) -> Table:
-        """The table for the terminal."""
-        from rich import box
-        from rich.table import Table
-
+        """The table, for the terminal and for Markdown."""
         rows = self.rows()
-        table = Table(title=self.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for name in rows[0]:
-            table.add_column(name, justify="left" if name == "controller" else "right", no_wrap=True)
-        for row in rows:
-            table.add_row(*row.values(), style="bold" if row["controller"] == "MPC_3" else None)
-        return table
+        styles = ["bold" if row["controller"] == "MPC_3" else "" for row in rows]
+        return Table([*rows[0]], [[*row.values()] for row in rows], self.title, "lr", styles=styles)
 
     def markdown(self) -> str:
         """The table and its notes in Markdown."""
-        rows = self.rows()
-        lines = [
-            list(rows[0]),
-            ["---"] + ["--:"] * (len(rows[0]) - 1),
-            *([*map(markdown, row.values())] for row in rows),
-        ]
-        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         notes = "\n".join(f"* {markdown(note)}" for note in self.notes())
         ids = f"Data: {markdown_code(self.dataset_id)}, environment {markdown_code(self.env_id)}."
-        return f"# {markdown(self.title)}\n\n{table}\n\n{notes}\n\n{ids}\n"
+        return f"# {markdown(self.title)}\n\n{self.table().markdown()}\n\n{notes}\n\n{ids}\n"
 
     def save(self, folder: Path) -> list[Path]:
         """Writes results.md (table and notes), results.csv (table) and, last, results.json (everything).

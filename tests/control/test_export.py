@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import casadi as ca
 import lq_plant
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from mpc_problems import CARTPOLE, LINEAR, PENDULUM, random_linear, random_state
 from mpcoffline import MPCPolicy, OfflineMPCLearner
 from mpcoffline.control.export import export_c
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.mpc import MPC, NetworkCost
+from mpcoffline.mpc import MPC, Model, NetworkCost, QuadraticCost
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers.ddp.build import find_compiler
 
@@ -62,6 +63,30 @@ def test_without_vectors_nothing_is_said_to_pass(
         [compiled(tmp_path), tmp_path / "test_vectors.txt"], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout) == (2, "no test vectors: nothing was tested\n")
+
+
+def heated(unit: float, offset: float) -> MPC:
+    """A body under a heater, its temperatures in a unit and above an offset of one's choice."""
+
+    def rates(x: ca.SX, u: ca.SX, p: object) -> ca.SX:
+        t = (x - offset) / unit
+        return unit * ca.vertcat(2.0 * u[0] - 0.4 * (t[0] - t[1]) - 0.2 * t[0], 0.3 * (t[0] - t[1]) - 0.05 * t[1] ** 2)
+
+    goal, weight = offset + unit * np.array([0.6, 0.5]), np.diag([0.1, 1.0]) / unit**2
+    stage, terminal = QuadraticCost(weight, [[0.01]], x_ref=goal), QuadraticCost(weight, x_ref=goal)
+    return MPC(Model(rates, 2, 1, 0.2), stage, terminal, 15, 0.97, [0.0], [1.0])
+
+
+@pytest.mark.parametrize(("unit", "offset"), [(1000.0, 0.0), (1.0, 293.15)])
+def test_the_vectors_are_where_the_plant_is_in_any_unit(unit: float, offset: float, tmp_path: Path) -> None:
+    rows = []
+    for folder, mpc in ((tmp_path / "plain", heated(1.0, 0.0)), (tmp_path / "moved", heated(unit, offset))):
+        export_c(MPCPolicy(mpc), folder)
+        rows.append(np.loadtxt(folder / "test_vectors.txt"))
+    plain, moved = rows
+    np.testing.assert_allclose(moved[:, 1:3], offset + unit * plain[:, 1:3], rtol=1e-6, atol=1e-6 * unit)
+    np.testing.assert_allclose(moved[:, 3], plain[:, 3], atol=1e-6)
+    assert np.ptp(plain[:, 3]) > 0.5  # of the heater's range
 
 
 MAIN = """

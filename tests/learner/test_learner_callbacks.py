@@ -78,6 +78,32 @@ def test_an_sb3_callback_ends_once(stop_at: int, epochs: int) -> None:
     assert (counting.starts, counting.ends) == (2, 2)
 
 
+def test_an_sb3_callback_ends_also_where_another_ends_the_fit() -> None:
+    """Or where an error does, or the caller of `fitter`; never where it had not begun."""
+    counting = Counting(stop_at=100)
+    callback, log = SB3Callback(counting), lq_plant.random_log(300)
+    options: dict[str, Any] = {"n_steps_per_epoch": 20, "show_progress": False}
+
+    def stop(_: OfflineMPCLearner, epoch: int, __: int) -> bool:
+        return epoch < 4
+
+    def fail(_: OfflineMPCLearner, epoch: int, __: int) -> None:
+        if epoch == 4:
+            raise ZeroDivisionError
+
+    learner().fit(log, callbacks=[callback, stop], **options)
+    assert (counting.starts, counting.ends) == (1, 1)
+    with pytest.raises(ZeroDivisionError):
+        learner().fit(log, callbacks=[callback, fail], **options)
+    assert (counting.starts, counting.ends) == (2, 2)
+    epochs = learner().fitter(log, callbacks=[callback], **options)
+    assert [next(epochs)[0] for _ in range(4)] == [1, 2, 3, 4]
+    epochs.close()  # type: ignore[attr-defined]
+    assert (counting.starts, counting.ends) == (3, 3)
+    learner().fit(log, callbacks=[callback, lambda *_: False], **options)  # while (VALUE) goes on
+    assert (counting.starts, counting.ends) == (3, 3)
+
+
 def test_evaluators_see_what_would_be_handed_out() -> None:
     """A fit that ends after an epoch hands out the MPC that was seen then, terminal cost and all."""
     seen: list[MPC] = []

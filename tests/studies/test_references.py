@@ -8,8 +8,9 @@ import pytest
 from grid_dp import GridOptimum, simulate
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.envs.episode import EPISODE_STEPS
 from mpcoffline.gallery.collection import starting_states
-from mpcoffline.studies.references import EPISODE, best_known_costs, replay
+from mpcoffline.studies.references import best_known_costs, replay
 
 PENDULUM, CARTPOLE = "mpcoffline/PendulumSwingUp-v0", "mpcoffline/CartPoleSwingUp-v0"
 
@@ -17,13 +18,13 @@ PENDULUM, CARTPOLE = "mpcoffline/PendulumSwingUp-v0", "mpcoffline/CartPoleSwingU
 def test_a_replay_is_the_environment() -> None:
     env = gym.make(CARTPOLE)
     states = starting_states(env, ["broad", "hanging"], seed=3)
-    actions = np.random.default_rng(0).uniform(-2, 2, size=(2, EPISODE, 1))
+    actions = np.random.default_rng(0).uniform(-2, 2, size=(2, EPISODE_STEPS, 1))
     found = replay(CARTPOLE, states, actions, discount=0.9)
     for i, start in enumerate(("broad", "hanging")):
         _, info = env.reset(seed=3 + i, options={"start": start})
         np.testing.assert_array_equal(info["state"], states[i])
         total = 0.0
-        for k in range(EPISODE):
+        for k in range(EPISODE_STEPS):
             _, _, _, _, info = env.step(actions[i, k].astype(np.float32))
             total += 0.9**k * info["cost"]
             np.testing.assert_array_equal(info["state"], found.states[i, k + 1])
@@ -32,7 +33,7 @@ def test_a_replay_is_the_environment() -> None:
 
 def test_no_guess_is_cheaper() -> None:
     states = starting_states(gym.make(CARTPOLE), ["broad"] * 3, seed=0)
-    guess = np.random.default_rng(1).uniform(-0.5, 0.5, size=(3, EPISODE, 1))
+    guess = np.random.default_rng(1).uniform(-0.5, 0.5, size=(3, EPISODE_STEPS, 1))
     costs = best_known_costs("cartpole", states, [guess])
     assert (costs <= replay(CARTPOLE, states, guess).cost).all()
     assert (costs <= best_known_costs("cartpole", states)).all()

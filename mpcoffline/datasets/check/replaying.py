@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ from gymnasium.envs.registration import EnvSpec
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
+from mpcoffline.core.progress import Bars
+from mpcoffline.core.tables import Table, verdict
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.hub.loading import load_dataset
 
@@ -81,15 +84,8 @@ class ReplayReport:
         return visible("\n".join([self.headline, *rows, *self._remarks()]))
 
     def __rich__(self) -> RenderableType:
-        from rich.console import Group
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table("largest deviation", "whole episode", "one step", "tolerance", box=None, pad_edge=False)
-        for row in self._rows():
-            table.add_row(*row)
-        headline = Text(visible(self.headline), style="bold green" if self.ok else "bold red")
-        return Group(headline, table, *(Text(visible(line)) for line in self._remarks()))
+        table = Table(("largest deviation", "whole episode", "one step", "tolerance"), self._rows())
+        return verdict(self.headline, self.ok, table, self._remarks())
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         def cell(deviations: Mapping[str, Deviation], name: str) -> str:
@@ -152,17 +148,11 @@ def replay(
     indices = dataset.episode_indices
     if n_episodes is not None and n_episodes < len(indices):
         indices = indices[np.linspace(0, len(indices) - 1, n_episodes).round().astype(int)]
-    episodes = dataset.iterate_episodes(indices)
-    if progress:
-        from rich.progress import track
-
-        episodes = track(episodes, description="Simulating again", total=len(indices))
     simulation = Simulation(env, dataset)
-    try:
-        for episode in episodes:
+    with closing(env), Bars(progress) as bars:
+        for done, episode in enumerate(dataset.iterate_episodes(indices), start=1):
             simulation.run(episode)
-    finally:
-        env.close()
+            bars.show("Simulating again", done, len(indices))
     return ReplayReport(
         dataset_id=dataset.spec.dataset_id,
         env_id=env.spec.id if env.spec is not None else "",

@@ -14,6 +14,7 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,7 @@ from filelock import FileLock, Timeout
 from mpcoffline.core.atomic import publish
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError, UnknownIdError
 from mpcoffline.core.outputs import write_file
+from mpcoffline.core.progress import Bars
 from mpcoffline.datasets.recipes import catalog_file
 from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.manifest import MANIFEST, differences, read_manifest, sha256_of, write_manifest
@@ -243,16 +245,10 @@ def _fetch_all(place: Remote, listing: Listing, staged: Path, *, unchecked: bool
     missing = [path for path in wanted if path not in files]
     if missing:
         raise FileFormatError(name, expected=f"the files of its {MANIFEST}", actual=f"no {missing[0]}")
-    if not progress:
+    with Bars(progress, of_bytes=True) as bars:
         for path in wanted:
-            fetch(place, listing, files[path], staged)
-        return
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-
-    with Progress(TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()) as bars:
-        for path in wanted:
-            bar = bars.add_task(path, total=files[path].size)
-            fetch(place, listing, files[path], staged, lambda size, bar=bar: bars.advance(bar, size))  # type: ignore[misc]
+            bars.show(path, 0, files[path].size)
+            fetch(place, listing, files[path], staged, partial(bars.advance, path))
 
 
 def _own_manifest(staged: Path) -> dict[str, str]:

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, StorageError
+from mpcoffline.core.tables import Table, verdict
 from mpcoffline.core.text import visible
 
 from .hdf5_guard import episode_number
@@ -98,18 +99,11 @@ class VerifyReport:
         return visible("\n".join(lines))
 
     def __rich__(self) -> RenderableType:
-        from rich.console import Group
-        from rich.table import Table
-        from rich.text import Text
-
-        headline = Text(visible(self.headline), style="bold green" if self.ok else "bold red")
-        if not self.findings:
-            return headline
-        table = Table("check", "where", "what", box=None, pad_edge=False)
-        for finding in self.findings[:SHOWN]:
-            style = "red" if finding.serious else "yellow"
-            table.add_row(Text(finding.check, style=style), Text(finding.place), Text(visible(finding.message)))
-        return Group(headline, table, *(Text(line) for line in self._more()))
+        shown = self.findings[:SHOWN]
+        rows = [(finding.check, finding.place, finding.message) for finding in shown]
+        styles = ["red" if finding.serious else "yellow" for finding in shown]
+        table = Table(("check", "where", "what"), rows, styles=styles) if rows else None
+        return verdict(self.headline, self.ok, table, self._more())
 
     def _more(self) -> list[str]:
         hidden = len(self.findings) - SHOWN

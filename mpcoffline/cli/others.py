@@ -1,0 +1,58 @@
+"""Commands that other packages add: one entry point each, in the group ``mpcoffline.commands``.
+
+A package ``pyproject.toml`` says ``[project.entry-points."mpcoffline.commands"]`` and ``hello = "package.module:app"``;
+``app`` is a ``typer.Typer``. Help and completion name the command; the package is imported when it is called.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+from mpcoffline.core.errors import InvalidArgumentError
+
+GROUP = "mpcoffline.commands"
+
+
+class AddedCommand(TyperCommand):
+    """A command of another package, as help shows it: nothing of that package is imported for it.
+
+    Args:
+        entries: The entry points of that name; more than one if packages have taken the same.
+    """
+
+    def __init__(self, entries: list[EntryPoint]) -> None:
+        self._entries = entries
+        self._packages = " and ".join(sorted({entry.dist.name for entry in entries if entry.dist is not None}))
+        super().__init__(entries[0].name, help=f"Added by {self._packages}.", rich_help_panel="Other packages")
+
+    def loaded(self) -> Any:
+        """The command itself.
+
+        Raises:
+            InvalidArgumentError: If it is broken or no ``typer.Typer``, or several packages have taken its name.
+        """
+        what = f"command {self.name!r} of {self._packages}"
+        if len(self._entries) > 1:
+            raise InvalidArgumentError(what, expected="one package that adds it", actual="several")
+        try:
+            app = self._entries[0].load()
+        except Exception as error:  # whatever goes wrong in that package
+            raise InvalidArgumentError(
+                what, expected="a package that can be imported", actual=f"{type(error).__name__}: {error}"
+            ) from error
+        if not isinstance(app, typer.Typer):
+            raise InvalidArgumentError(what, expected="a typer.Typer", actual=repr(app)[:200])
+        return typer.main.get_command(app)
+
+
+def added_commands() -> dict[str, AddedCommand]:
+    """The commands of the installed packages by name."""
+    found = defaultdict(list)
+    for entry in entry_points(group=GROUP):
+        found[entry.name].append(entry)
+    return {name: AddedCommand(entries) for name, entries in sorted(found.items())}

@@ -1,0 +1,65 @@
+"""How long work shows where it is: bars with names, for those who want them."""
+
+from __future__ import annotations
+
+from typing import Self
+
+
+class Bars:
+    """Progress bars by name, one under another, on rich's console; or nothing at all.
+
+    Example:
+        >>> with Bars() as bars:
+        ...     for k in range(1000):
+        ...         bars.show("counting", k + 1, 1000, f"at {k}")
+
+    Args:
+        shown: Whether to draw any; without, nothing is printed.
+        of_bytes: Whether it is bytes that are counted.
+    """
+
+    def __init__(self, shown: bool = True, *, of_bytes: bool = False) -> None:
+        from rich.progress import (
+            BarColumn,
+            DownloadColumn,
+            MofNCompleteColumn,
+            Progress,
+            ProgressColumn,
+            TaskID,
+            TextColumn,
+            TimeRemainingColumn,
+            TransferSpeedColumn,
+        )
+        from rich.table import Column
+
+        bytes_, steps = (DownloadColumn, TransferSpeedColumn), (MofNCompleteColumn, TimeRemainingColumn)
+        counts: list[ProgressColumn] = [column() for column in (bytes_ if of_bytes else steps)]
+        text = TextColumn("{task.description}", markup=False, table_column=Column())  # which wraps: the counts are seen
+        self._bars = Progress(text, BarColumn(bar_width=20), *counts, disable=not shown)
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._bars.disable:  # rich before 14.3 prints an empty line even so
+            self._bars.stop()
+
+    def show(self, name: str, done: int, total: int, text: str = "") -> None:
+        """Moves the bar of a name, which the first call adds.
+
+        Args:
+            name: What is done.
+            done: How much of it.
+            total: How much there is.
+            text: What to say beside the name.
+        """
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(name)
+        description = f"{name}: {text}" if text else name
+        self._bars.update(self._tasks[name], completed=done, total=total, description=description)
+
+    def advance(self, name: str, by: int) -> None:
+        """Moves the bar of a name that :meth:`show` has added."""
+        self._bars.advance(self._tasks[name], by)
