@@ -152,10 +152,7 @@ class Solver(ABC):
         Raises:
             InvalidArgumentError: For an MPC that cannot be written to JSON.
         """
-        try:
-            document = self.mpc.to_json()
-        except AttributeError as error:  # an own cost
-            raise InvalidArgumentError("mpc", expected="one that has a JSON form", actual=str(error)) from error
+        document = self.mpc.to_json(portable=True)
         return _made_again, (type(self), document, self._made_with), {"reason": self.reason}
 
     def __repr__(self) -> str:

@@ -41,9 +41,9 @@ class WorkerPool:
 
     def __init__(self, mpc: MPC, options: Mapping[str, Any], n_workers: int) -> None:
         try:
-            document = mpc.to_json()
+            document = mpc.to_json(portable=True)
             MPC.from_json(document)
-        except (MPCOfflineError, AttributeError) as error:
+        except MPCOfflineError as error:
             raise InvalidArgumentError(
                 "n_workers", expected="1 for an MPC that has no JSON form", actual=f"{n_workers} ({error})"
             ) from error
