@@ -13,11 +13,17 @@ import numpy as np
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import Array, Plan
 from mpcoffline.solvers.starts import candidate_inputs
+from mpcoffline.solvers.status import Status
 
 from .transcription import Multipliers, Transcription
 
 _FEASIBILITY_TOLERANCE = 1e-6  # of the size of the states
 _OPTIMALITY_TOLERANCE = 1e-5  # of the size of the terms of the gradient
+_ENDS = {  # what ipopt says of itself, where its point did not pass the tests
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+}
 
 
 class Programs:
@@ -64,8 +70,8 @@ class Found:
         x: ``(N + 1, nx)``.
         u: ``(N, nu)``.
         value: The objective.
-        success: Whether the trajectory passed all tests.
-        status: ipopt's word, and what is wrong.
+        status: Whether the trajectory passed all tests, and if not, why.
+        words: ipopt's word, and what is wrong.
         iterations: Of ipopt, all starts together.
         residual: Of the first-order conditions, relative.
         violation: Of the constraint that is violated most; 0 where all hold.
@@ -74,11 +80,16 @@ class Found:
     x: Array
     u: Array
     value: float
-    success: bool
-    status: str
+    status: Status
+    words: str
     iterations: int
     residual: float
     violation: float
+
+    @property
+    def success(self) -> bool:
+        """Whether the trajectory passed all tests."""
+        return self.status is Status.CONVERGED
 
 
 class Program:
@@ -164,17 +175,16 @@ class Program:
         violation, where = problem.violation(point, p)
         multipliers = Multipliers(result["lam_x"].full().ravel(), result["lam_g"].full().ravel())
         residual = problem.optimality(point, p, u0, multipliers)
-        status = str(stats["return_status"])
+        word = str(stats["return_status"])
+        status, failure = Status.CONVERGED, ""
         if not (followed and np.isfinite(value)):
-            failure = "the model run with the inputs found is not finite"
+            status, failure = Status.NOT_FINITE, ": the model run with the inputs found is not finite"
         elif not violation <= _tolerated(x):
-            failure = f"{where} is violated by {violation:.3g}"
+            status, failure = _ENDS.get(word, Status.VIOLATED), f": {where} is violated by {violation:.3g}"
         elif not residual <= _OPTIMALITY_TOLERANCE:
-            failure = f"not optimal, the first-order conditions leave {residual:.1e}"
-        else:
-            failure = ""
-        words = f"{status}: {failure}" if failure else status
-        return Found(x, u, value, not failure, words, int(stats["iter_count"]), residual, violation)
+            status = _ENDS.get(word, Status.NOT_OPTIMAL)
+            failure = f": not optimal, the first-order conditions leave {residual:.1e}"
+        return Found(x, u, value, status, word + failure, int(stats["iter_count"]), residual, violation)
 
 
 def _tolerated(x: Array) -> float:

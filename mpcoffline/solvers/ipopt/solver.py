@@ -9,15 +9,17 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Array, OneAtATime, Plan, Solution, Solver
+from mpcoffline.solvers.interface import SOLVERS, Array, OneAtATime, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
 from mpcoffline.solvers.starts import N_CANDIDATES
+from mpcoffline.solvers.status import Stats
 
 from .program import Programs
 from .workers import WorkerPool
 
 
+@SOLVERS.register("ipopt")
 class IpoptSolver(Solver):
     """Direct multiple shooting with CasADi and ipopt.
 
@@ -28,7 +30,7 @@ class IpoptSolver(Solver):
 
     What is returned is the model run with the inputs found, within their bounds, and what that costs. ``success`` says
     that this trajectory violates no constraint and that the first-order conditions hold at it
-    (``stats["residual"]``), whatever ipopt returned. Otherwise ``status`` says what is wrong, e.g.
+    (``stats["residual"]``), whatever ipopt returned. Otherwise ``words`` say what is wrong, e.g.
     ``"Infeasible_Problem_Detected: 'speed limit' at stage 3 is violated by 0.2"``.
 
     Args:
@@ -42,7 +44,6 @@ class IpoptSolver(Solver):
             which takes seconds, and end with the solver; results do not depend on their number.
     """
 
-    name = "ipopt"
     theta_dimensions = (1, 2, 3)
 
     def __init__(
@@ -56,7 +57,12 @@ class IpoptSolver(Solver):
         n_workers: int = 1,
     ) -> None:
         super().__init__(
-            mpc, n_starts=n_starts, tolerance=tolerance, max_iterations=max_iterations, n_workers=n_workers
+            mpc,
+            n_starts=n_starts,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            max_time=max_time,
+            n_workers=n_workers,
         )
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
@@ -89,12 +95,13 @@ class IpoptSolver(Solver):
             else:
                 found = self._programs.solve(x, theta, u0, warm_start)
         u = np.stack([one.u for one in found])
-        stats: dict[str, Any] = {
+        stats: Stats = {
             "iterations": np.array([one.iterations for one in found]),
             "time": time.perf_counter() - start,
             "residual": np.array([one.residual for one in found]),
             "violation": np.array([one.violation for one in found]),
             "all_starts": True,
+            "words": [one.words for one in found],
         }
         success, values = np.array([one.success for one in found]), np.array([one.value for one in found])
         trajectories = np.stack([one.x for one in found])
