@@ -242,7 +242,7 @@ class Recording(Solver):
 @pytest.fixture
 def recording(monkeypatch: pytest.MonkeyPatch) -> MPCPolicy:
     """A policy with the solver above."""
-    monkeypatch.setitem(SOLVERS, "recording", Recording)
+    monkeypatch.setitem(SOLVERS._things, "recording", Recording)
     monkeypatch.setattr(Recording, "calls", [])
     monkeypatch.setattr(Recording, "fail", set())
     return MPCPolicy(lq_plant.make_mpc(action_low=[-1.5], action_high=[1.75]), "recording")
@@ -358,7 +358,7 @@ def test_a_failed_solve_applies_the_previous_plan(recording: MPCPolicy, caplog: 
 def test_without_a_plan_a_failure_gives_zero_within_bounds(
     monkeypatch: pytest.MonkeyPatch, low: float, high: float, expected: float
 ) -> None:
-    monkeypatch.setitem(SOLVERS, "recording", Recording)
+    monkeypatch.setitem(SOLVERS._things, "recording", Recording)
     monkeypatch.setattr(Recording, "calls", [])
     monkeypatch.setattr(Recording, "fail", {0, 1})
     policy = MPCPolicy(lq_plant.make_mpc(action_low=[low], action_high=[high]), "recording")
@@ -380,11 +380,44 @@ def test_a_closed_loop_survives_a_solver_that_always_fails(monkeypatch: pytest.M
             stats = {"iterations": np.zeros(n, dtype=int), "time": 0.0}
             return Solution(u[:, 0], states, u, np.full(n, np.nan), np.zeros(n, dtype=bool), ["no"] * n, stats)
 
-    monkeypatch.setitem(SOLVERS, "hopeless", Hopeless)
+    monkeypatch.setitem(SOLVERS._things, "hopeless", Hopeless)
     policy = MPCPolicy(short_pendulum(), "hopeless")
     result = evaluate(policy, PENDULUM, 2)
     assert (np.concatenate(result.actions) == 0.0).all()
     assert policy.solver_stats.n_failures == policy.solver_stats.n_solves == 200
+
+
+# ---------------------------------------------------------------- a solver that is made already
+
+
+def test_a_solver_stands_where_its_name_does(tmp_path: Path) -> None:
+    mpc = short_pendulum()
+    solver = IpoptSolver(mpc, n_starts=2, max_iterations=50)
+    policy, named = MPCPolicy(mpc, solver), MPCPolicy(mpc, "ipopt", n_starts=2, max_iterations=50)
+    assert policy.solver is solver
+    assert (policy.solver_name, policy.solver_options) == (named.solver_name, named.solver_options)
+    policy.save(tmp_path / "policy.zip")
+    x = np.array([0.3, 0.9, 0.1])
+    expected = named.predict(x)[0]
+    for again in (policy, MPCPolicy.load(tmp_path / "policy.zip"), copy.deepcopy(policy)):
+        np.testing.assert_array_equal(again.predict(x)[0], expected)
+    with pytest.raises(
+        InvalidArgumentError, match="solver: expected a name with options, or a solver of this very MPC"
+    ):
+        MPCPolicy(mpc, solver, n_starts=3)
+    with pytest.raises(InvalidArgumentError, match="of another MPC"):
+        MPCPolicy(short_pendulum(), solver)
+
+
+def test_a_policy_whose_solver_no_file_can_name_is_not_saved(tmp_path: Path) -> None:
+    class Mine(IpoptSolver):
+        pass
+
+    mpc = short_pendulum()
+    policy = MPCPolicy(mpc, Mine(mpc))
+    with pytest.raises(InvalidArgumentError, match="solver: expected one that is registered, .* got Mine"):
+        policy.save(tmp_path / "policy.zip")
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- bad input

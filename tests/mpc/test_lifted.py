@@ -20,7 +20,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.learning import FitConfig, fit_parameters
 from mpcoffline.mpc import MPC, LiftedCost, Model, NormCost, QuadraticCost, polynomial_features
-from mpcoffline.mpc.cost import cost_from_json
+from mpcoffline.mpc.component import cost_from_json
 from mpcoffline.mpc.torch_twin import TorchTwin
 from mpcoffline.solvers import make_solver
 
