@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mpcoffline import MPC, OfflineMPCLearner, TransitionTable, make_solver, nominal_mpc
-from mpcoffline.learning.bellman.equation import BellmanFit
+from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, new_figure, paper_style
 from mpcoffline.plotting.panels import on_plane, task_of
 
@@ -118,7 +118,7 @@ def diagonal(axes: Axes, end: float) -> None:
 def regression(mpc: MPC, learner: OfflineMPCLearner, table: TransitionTable) -> tuple[Array, Array]:
     """Of (FIT): what the stage cost is asked to be, and what it is, each ``(n,)``."""
     assert learner.value_function is not None
-    problem = BellmanFit(mpc.replace(discount=learner.mpc.discount), learner.value_function, 1.0)
+    problem = BellmanProblem(mpc.replace(discount=learner.mpc.discount), learner.value_function, 1.0)
     columns, theta = table.columns(torch.from_numpy(np.array(table.rows))), torch.from_numpy(mpc.theta)
     with torch.no_grad():
         asked = problem.target(columns) - problem.predicted_value(columns, theta)
@@ -144,7 +144,7 @@ def main() -> None:
         learner = OfflineMPCLearner.load(saved)
     for name, mpc in (("theta_0", learner.nominal_mpc), ("theta", learner.mpc)):
         print(name, {key: np.round(array, 3).tolist() for key, array in mpc.values.items()})
-    seen, learned_from = some(table), some(table.trim(learner.config.trim))
+    seen, learned_from = some(table), some(table.trim(learner.method.trim))
     for theme, (*_, before, after) in COLORS.items():
         with themed(theme):
             for name, figure in (

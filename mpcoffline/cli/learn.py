@@ -224,8 +224,9 @@ def _described(learner: OfflineMPCLearner, data: MinariDataset) -> dict[str, Any
     return {
         "dataset": str(data.spec.dataset_id),
         "preset": learner.preset,
+        "method": learner.method.name,
         "learn": learner.learn,
-        "value_method": learner.config.value.method,
+        "value_method": learner.method.options.get("value"),
         "seed": learner.seed,
         "discount": learner.mpc.discount,
         "horizon": learner.mpc.horizon,

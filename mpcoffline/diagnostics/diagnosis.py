@@ -123,7 +123,7 @@ def diagnose(
             reference,
         ),
     )
-    return report.with_notes(_notes(report, smoothed=learner.config.init == "identified"))
+    return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:

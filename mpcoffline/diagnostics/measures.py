@@ -13,7 +13,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman.equation import BellmanFit, variance_of
+from mpcoffline.learning.bellman.equation import BellmanProblem, variance_of
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.features import RandomFeatures, Ridge
 
@@ -132,12 +132,12 @@ def fit_errors(
     columns = sample.columns(torch.from_numpy(sample.rows))
     unit = variance_of(sample.costs)
     before, after = (
-        _residuals(BellmanFit(mpc, value, unit), mpc, columns)
+        _residuals(BellmanProblem(mpc, value, unit), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)
     )
     potential = None if result is None else result.potential
     if potential is not None:
-        model = BellmanFit(learned, value, unit)
+        model = BellmanProblem(learned, value, unit)
         with torch.no_grad():
             reached = model.predicted(columns, torch.from_numpy(learned.theta))
             shaping = potential(columns.observations) - model.discounted(columns) * potential(reached)
@@ -154,7 +154,7 @@ def fit_errors(
     )
 
 
-def _residuals(problem: BellmanFit, mpc: MPC, columns: Columns) -> Array:
+def _residuals(problem: BellmanProblem, mpc: MPC, columns: Columns) -> Array:
     theta = torch.from_numpy(mpc.theta)
     with torch.no_grad():
         explained = problem.predicted_value(columns, theta) + problem.stage_cost(columns, theta)

@@ -155,7 +155,7 @@ def learner_fingerprint(one: OfflineMPCLearner) -> str:
     sizes = np.linspace(-1, 1, 3 * one.nominal_mpc.nx).reshape(3, -1)
     numbers = None if value is None else np.asarray(value.predict(sizes)).tolist()
     mpcs = [one.nominal_mpc.to_json(), one.mpc.to_json()]
-    settings = [one.learn, one.preset, one.seed, str(one.config), str(one.result)]
+    settings = [one.learn, one.preset, one.seed, str(one.method), str(one.result)]
     return json.dumps([numbers, mpcs, one.history, *settings], sort_keys=True, default=str)
 
 

@@ -16,8 +16,8 @@ import mpcoffline
 from mpcoffline import MPCPolicy, OfflineMPCLearner, nominal_mpc
 from mpcoffline.cli.common import Preset, ValueForm
 from mpcoffline.cli.main import app
-from mpcoffline.learner.presets import PRESETS, LearnerConfig
-from mpcoffline.learning import VALUE_METHODS
+from mpcoffline.learner.presets import PRESETS
+from mpcoffline.learning import VALUE_METHODS, Bellman
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 DATA = "mpcoffline/pendulum/ddpg-v0"
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.chdir(tmp_path)
-    brief = LearnerConfig().replaced(
+    brief = Bellman().replaced(
         {"value_n_steps": 20, "value_batch_size": 16, "hidden": (8,), "fit_n_steps": 2, "refit_rows": 300}
     )
     for name in ("default", "paper"):  # whether learning succeeds is tested elsewhere
@@ -53,7 +53,7 @@ def test_options_reach_the_fit_and_json_describes_it() -> None:
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     learner = OfflineMPCLearner.load("mine.zip")
-    assert (learner.preset, learner.learn, learner.config.value.method) == ("paper", "cost", "td")
+    assert (learner.preset, learner.learn, learner.method.options["value"]) == ("paper", "cost", "td")
     assert (learner.mpc.discount, learner.mpc.horizon, learner.seed) == (0.93, 7, 3)
     assert (document["discount"], document["horizon"], document["preset"]) == (0.93, 7, "paper")
     np.testing.assert_array_equal(document["learned"]["stage_cost.W"], learner.mpc.values["stage_cost.W"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.progress import Report, silent
+from mpcoffline.learning.progress import OnEpoch, silent
 
 from .config import VALUE_METHODS, ValueConfig, cosine
 from .function import ValueFunction
@@ -36,7 +36,7 @@ def fit_value(
     seed: int,
     device: str = "cpu",
     epoch: int = 500,
-    report: Report = silent,
+    report: OnEpoch = silent,
 ) -> ValueFunction:
     """Learns V_phi by stochastic gradient descent on one of the losses: a :class:`ValueTraining` from start to end.
 
