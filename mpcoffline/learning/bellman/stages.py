@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.errors import FileFormatError
@@ -239,7 +238,7 @@ class FitTerminal(Stage):
         terminal_cost = fit_terminal(
             kind,
             value if potential is None else lambda s: value(s) - potential(s),
-            known.table.take(_some_rows(len(known.table), _TERMINAL_ROWS)).observations,
+            known.table.sample(_TERMINAL_ROWS, 0).observations,
             x_ref=goal,
             blend=self._config.blend,
             seed=known.seed,
@@ -257,7 +256,7 @@ def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
 
     (FIT) measures distances in the size of theta_0, which has to be that of the cost in the data within a factor of 30.
     """
-    rows = table.columns(table.rows[_some_rows(len(table), _SCALE_ROWS)])
+    rows = table.sample(_SCALE_ROWS, 0)  # at random: a stride would meet the length of episodes
     stage = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full()
     logged, nominal = float(rows.costs.std(dtype=np.float64)), float(stage.std())
     factor = logged / nominal if nominal > 0.0 else 1.0
@@ -270,8 +269,3 @@ def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
     outcome = f"{', '.join(weights)} scaled to it" if weights else "scale that by hand"
     _log.warning("the logged cost varies %.3g times as much as the MPC's stage cost: %s", factor, outcome)
     return mpc.with_theta(theta)
-
-
-def _some_rows(n: int, most: int) -> NDArray[np.int64]:
-    """Row numbers in order, at most so many, the same at each call; a stride would meet the length of episodes."""
-    return np.sort(np.random.default_rng(0).permutation(n)[:most])
