@@ -125,12 +125,6 @@ def regression(mpc: MPC, learner: OfflineMPCLearner, table: TransitionTable) -> 
         return asked.numpy(), problem.stage_cost(columns, theta).numpy()
 
 
-def some(table: TransitionTable) -> TransitionTable:
-    """A few transitions at random."""
-    rows = np.sort(np.random.default_rng(0).permutation(len(table))[:SHOWN])
-    return TransitionTable(table.rows[rows], table.ny, table.nu, table.episode_ids[rows])
-
-
 def main() -> None:
     """Learns, or loads, and draws."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -144,7 +138,7 @@ def main() -> None:
         learner = OfflineMPCLearner.load(saved)
     for name, mpc in (("theta_0", learner.nominal_mpc), ("theta", learner.mpc)):
         print(name, {key: np.round(array, 3).tolist() for key, array in mpc.values.items()})
-    seen, learned_from = some(table), some(table.trim(learner.method.trim))
+    seen, learned_from = table.sample(SHOWN, 0), table.trim(learner.method.trim).sample(SHOWN, 0)
     for theme, (*_, before, after) in COLORS.items():
         with themed(theme):
             for name, figure in (

@@ -134,12 +134,7 @@ def download_dataset(
         return open_dataset(dataset_path(dataset_id))
     source = find_source(dataset_id, remote, revision)
     if source is None:
-        raise InvalidArgumentError(
-            "remote",
-            expected="one that is configured",
-            actual="none",
-            hint=f"Set {SETTING}=hf://ORGANISATION (or gcp://BUCKET) to where the data set is, or pass remote=.",
-        )
+        raise _no_remote()
     check_not_recorded(dataset_id)
     with _download_folder(dataset_id) as folder:
         staged = folder / "dataset"
@@ -180,9 +175,7 @@ def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | N
         raise InvalidDataError(f"data set {dataset_id!r}", expected="no finding of `verify`", actual=str(report))
     url = remote or os.environ.get(SETTING)
     if not url:
-        raise InvalidArgumentError(
-            "remote", expected="one that is configured", actual="none", hint=f"Set {SETTING}=hf://ORGANISATION."
-        )
+        raise _no_remote()
     place = open_remote(url, token)
     try:
         place.listing(dataset_id, None)
@@ -204,6 +197,11 @@ def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | N
     if digest != sha256_of(folder / MANIFEST):
         raise RemoteError(f"remote {url}: {MANIFEST}", expected="what was uploaded", actual=f"sha256 {digest}")
     return UploadReceipt(dataset_id, Source(url, listing.revision, digest))
+
+
+def _no_remote() -> InvalidArgumentError:
+    hint = f"Set {SETTING}=hf://ORGANISATION (or gcp://BUCKET) to where data sets are, or pass remote=."
+    return InvalidArgumentError("remote", expected="one that is configured", actual="none", hint=hint)
 
 
 def _upload(url: str, token: str | None, dataset_id: str) -> None:
@@ -283,13 +281,12 @@ def _check(staged: Path, dataset_id: str, source: Source, *, unchecked: bool) ->
                 hint="Run it again to fetch it once more; if that repeats, the remote's copy is damaged.",
             )
     try:
-        found = open_dataset(staged).spec.dataset_id
+        if (found := open_dataset(staged).spec.dataset_id) != dataset_id:
+            name = f"{source.remote}: {dataset_id}"
+            raise FileFormatError(name, expected="a data set of that id", actual=repr(found))
     except FileFormatError:
         shutil.rmtree(staged)
         raise
-    if found != dataset_id:
-        shutil.rmtree(staged)
-        raise FileFormatError(f"{source.remote}: {dataset_id}", expected="a data set of that id", actual=repr(found))
 
 
 @contextmanager

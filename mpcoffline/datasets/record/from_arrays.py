@@ -10,13 +10,12 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
-from mpcoffline.datasets.store.writing import write_dataset
+from mpcoffline.datasets.store.writing import episode_of, write_dataset
 from mpcoffline.datasets.table.arrays import types_that_hold
 from mpcoffline.datasets.table.numbers import floats
 
 if TYPE_CHECKING:
     from minari import MinariDataset
-    from minari.data_collector import EpisodeBuffer
 
 
 def dataset_from_arrays(
@@ -74,7 +73,7 @@ def dataset_from_arrays(
     return write_dataset(
         dataset_id,
         (
-            _episode(s.astype(state_type), a.astype(action_type), s, cost, end)
+            episode_of(s.astype(state_type), a.astype(action_type), cost, s, terminated=end)
             for (s, a, cost), end in zip(checked, ends, strict=True)
         ),
         env_spec=None,
@@ -108,20 +107,3 @@ def _checked(
                 actual=str(values[step, i]),
             )
     return s, a, cost
-
-
-def _episode(
-    observations: NDArray[Any], actions: NDArray[Any], state: NDArray[Any], cost: NDArray[Any], terminated: bool
-) -> EpisodeBuffer:
-    from minari.data_collector import EpisodeBuffer
-
-    last = np.arange(len(actions)) == len(actions) - 1
-    columns: dict[str, Any] = {
-        "observations": observations,
-        "actions": actions,
-        "rewards": -cost,
-        "terminations": last & terminated,
-        "truncations": last & (not terminated),
-        "infos": {"cost": np.concatenate([[0.0], cost])[:, None], "state": state},
-    }
-    return EpisodeBuffer(**columns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.resources
 import os
 import warnings
@@ -57,12 +56,8 @@ def open_local(dataset_id: str) -> MinariDataset:
     """
     if is_here(dataset_id):
         return open_dataset(dataset_path(dataset_id)) if is_local(dataset_id) else _unpacked(dataset_id)
-    known = sorted({*local_datasets(), *shipped_datasets()})
-    nearest = difflib.get_close_matches(str(dataset_id), known, n=3, cutoff=0.4)
-    hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}? " if nearest else ""
-    raise UnknownIdError.of(
-        "data set id", str(dataset_id), known, hint=f"{hint}`mpcoffline collect` records a new one."
-    )
+    known = {*local_datasets(), *shipped_datasets()}
+    raise UnknownIdError.of("data set id", dataset_id, known, hint="`mpcoffline collect` records a new one.")
 
 
 def list_datasets() -> list[DatasetRow]:

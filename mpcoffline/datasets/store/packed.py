@@ -27,7 +27,7 @@ from mpcoffline.envs import ControlTask
 
 from .hdf5_guard import check_hdf5
 from .hdf5_writing import SteadyFile, write_steadily
-from .writing import write_dataset
+from .writing import episode_of, write_dataset
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -145,21 +145,8 @@ def unpack(path: str | Path, dataset_id: str, *, overwrite: bool = False) -> Min
 def _episode(
     task: ControlTask, states: NDArray[np.float64], actions: NDArray[np.float32], terminated: bool
 ) -> EpisodeBuffer:
-    from minari.data_collector import EpisodeBuffer
-
     costs = task.cost(states[:-1], actions.astype(np.float64))
-    terminations = np.zeros(len(actions), dtype=bool)
-    truncations = np.zeros(len(actions), dtype=bool)
-    terminations[-1], truncations[-1] = terminated, not terminated
-    columns: dict[str, Any] = {
-        "observations": task.observe(states),
-        "actions": actions,
-        "rewards": -costs,
-        "terminations": terminations,
-        "truncations": truncations,
-        "infos": {"cost": np.concatenate([[0.0], costs])[:, None], "state": states},
-    }
-    return EpisodeBuffer(**columns)
+    return episode_of(task.observe(states), actions, costs, states, terminated=terminated)
 
 
 def _recorded_states(where: str, episode: Any) -> NDArray[np.float64]:

@@ -13,8 +13,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
 
 from mpcoffline.core.atomic import publish, sync_tree
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError
@@ -57,6 +59,32 @@ def recording_of(dataset_id: str) -> str | None:
     except (OSError, FileFormatError):
         return None
     return name if isinstance(name, str) else None
+
+
+def episode_of(
+    observations: NDArray[Any], actions: NDArray[Any], costs: NDArray[Any], states: NDArray[Any], *, terminated: bool
+) -> EpisodeBuffer:
+    """An episode as Minari stores it, with costs and states among its infos.
+
+    Args:
+        observations: ``(T+1, ny)``.
+        actions: ``(T, nu)``.
+        costs: L(s, a), ``(T,)``; the rewards are -L.
+        states: ``(T+1, nx)``.
+        terminated: Whether it ended in a terminal state; otherwise it was cut off there.
+    """
+    from minari.data_collector import EpisodeBuffer
+
+    last = np.arange(len(actions)) == len(actions) - 1
+    columns: dict[str, Any] = {
+        "observations": observations,
+        "actions": actions,
+        "rewards": -costs,
+        "terminations": last & terminated,
+        "truncations": last & (not terminated),
+        "infos": {"cost": np.concatenate([[0.0], costs])[:, None], "state": states},
+    }
+    return EpisodeBuffer(**columns)
 
 
 def write_dataset(

@@ -248,18 +248,15 @@ def cached_table(
     except FileFormatError:
         shutil.rmtree(target, ignore_errors=True)
     with _scratch_folder(cache) as building:
+        write_table(building, ny, nu, blocks)
+        if (better := again()) is not None:
+            write_table(building, ny, nu, *better)
         try:
-            write_table(building, ny, nu, blocks)
-            if (better := again()) is not None:
-                write_table(building, ny, nu, *better)
-            try:
-                publish(building, target, overwrite=False)
-            except OSError:
-                if not target.exists():  # otherwise another process was faster: its table is as good
-                    raise
-            file = TableFile(target)
-        except OSError as error:
-            raise error if isinstance(error, StorageError) else StorageError.of(target, error) from error
+            publish(building, target, overwrite=False)
+        except OSError:
+            if not target.exists():  # otherwise another process was faster: its table is as good
+                raise
+        file = TableFile(target)
     trim(keep=target)
     return file
 
