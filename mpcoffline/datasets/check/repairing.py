@@ -29,7 +29,7 @@ from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_loc
 from mpcoffline.datasets.store.local import list_datasets
 from mpcoffline.datasets.store.manifest import MANIFEST, differences
 from mpcoffline.datasets.store.opening import DATA_FILE, check_space, open_dataset
-from mpcoffline.datasets.store.recording_lock import RecordingLock, log_files, recording_path
+from mpcoffline.datasets.store.recording_lock import RecordingLock, kept_path, log_files, recording_path
 from mpcoffline.datasets.store.writing import finish, recording_of
 
 _STEPS = ("actions", "rewards", "terminations", "truncations")
@@ -328,11 +328,7 @@ def _is_readable(dataset_id: str) -> bool:
 
 def _back_up(dataset_id: str) -> Path:
     """Keeps the folder as it is under another, hidden name: links where they can be, so that it needs no room yet."""
-    source, number = dataset_path(dataset_id), 0
-    start = dataset_path("") / ".broken" / dataset_id
-    start = start.with_name(os.fsdecode(os.fsencode(start.name)[:240]))  # names of files end at 255 bytes
-    while (backup := start.with_name(f"{start.name}-{number}")).exists():
-        number += 1
+    source, backup = dataset_path(dataset_id), kept_path(dataset_id)
     backup.parent.mkdir(parents=True, exist_ok=True)
     try:
         shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)

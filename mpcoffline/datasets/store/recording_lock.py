@@ -29,6 +29,15 @@ def log_files(dataset_id: str) -> list[Path]:
     return sorted(recording_path(dataset_id).glob("env-*.log"))
 
 
+def kept_path(dataset_id: str, kind: str = "") -> Path:
+    """A hidden folder that does not exist yet, for what is kept of a data set or of its logs."""
+    start = dataset_path(f".broken/{dataset_id}")
+    begin, number = os.fsdecode(os.fsencode(start.name)[:230]), 0  # names of files end at 255 bytes
+    while (kept := start.with_name(f"{begin}{kind}-{number}")).exists():
+        number += 1
+    return kept
+
+
 def check_not_recorded(dataset_id: str) -> None:
     """Refuses an id under which somebody records, or whose recording was interrupted.
 
