@@ -25,7 +25,7 @@ from gymnasium.envs.registration import EnvSpec
 from mpcoffline.core.atomic import publish, sync_tree
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError, UnknownIdError
 from mpcoffline.core.scratch import scratch_folder
-from mpcoffline.datasets.recipes import TASKS, Recipe, catalog_file
+from mpcoffline.datasets.recipes import Recipe, catalog_file, recorded_tasks
 
 from .ids import GRAMMAR, is_valid_id
 from .manifest import write_manifest
@@ -99,9 +99,9 @@ def list_datasets() -> list[DatasetRow]:
         name: DatasetRow(name, "local", metadata["total_episodes"], metadata["total_steps"])
         for name, metadata in local_datasets().items()
     }
-    for name, file in shipped_datasets().items():
+    for name, task in shipped_datasets().items():
         if name not in rows:
-            with importlib.resources.as_file(catalog_file(file)) as path:
+            with importlib.resources.as_file(catalog_file(f"{task}.h5", task)) as path:
                 rows[name] = DatasetRow(name, "shipped", *packed_size(path))
     return [rows[name] for name in sorted(rows)]
 
@@ -147,8 +147,9 @@ def _stored_ids(folder: Path, prefix: str, above: set[str]) -> Iterator[str]:
 
 
 def shipped_datasets() -> dict[str, str]:
-    """The shipped data sets: Minari id to the name of the packed file in the catalogue."""
-    return {Recipe.load(task).dataset_id: f"{task}.h5" for task in TASKS if catalog_file(f"{task}.h5").is_file()}
+    """The shipped data sets: Minari id to the name of the task, and so of the packed file in its catalogue."""
+    packed = [task for task in recorded_tasks() if catalog_file(f"{task}.h5", task).is_file()]
+    return {Recipe.load(task).dataset_id: task for task in packed}
 
 
 def dataset_path(dataset_id: str) -> Path:
@@ -300,13 +301,13 @@ def finish(building: Path, metadata: dict[str, str]) -> None:
     building.chmod(0o755)
 
 
-def _materialise(dataset_id: str, file: str) -> MinariDataset:
+def _materialise(dataset_id: str, task: str) -> MinariDataset:
     """Puts a shipped data set into the store, after checking that its file is the one that was shipped."""
     from .packed import unpack
 
-    sums = catalog_file("SHA256SUMS").read_text(encoding="utf-8").splitlines()
+    file, sums = f"{task}.h5", catalog_file("SHA256SUMS", task).read_text(encoding="utf-8").splitlines()
     expected = {name: digest for digest, name in (line.split() for line in sums if line.strip())}
-    with importlib.resources.as_file(catalog_file(file)) as path:
+    with importlib.resources.as_file(catalog_file(file, task)) as path:
         actual = hashlib.sha256(path.read_bytes()).hexdigest()
         if actual != expected.get(file):
             raise FileFormatError(
