@@ -37,4 +37,4 @@ def test_import_is_light_and_registers_the_environments() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     heavy, environments = done.stdout.split("\n")[:2]
     assert heavy == ""
-    assert environments.split() == list(mpcoffline.envs._TASKS)
+    assert environments.split() == list(mpcoffline.envs.ENV_IDS)

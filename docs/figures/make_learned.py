@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mpcoffline import MPC, OfflineMPCLearner, TransitionTable, make_solver, nominal_mpc
 from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, new_figure, paper_style
-from mpcoffline.plotting.panels import on_plane, task_of
+from mpcoffline.plotting.panels import on_plane, plane_of, task_of
 
 Array = NDArray[np.float64]
 
@@ -57,11 +57,11 @@ def themed(theme: str) -> Iterator[None]:
 
 def log_and_value(table: TransitionTable, learner: OfflineMPCLearner) -> Figure:
     """What is in the log, and what (VALUE) makes of it: costs of single steps, and V."""
-    task, labels = task_of(PENDULUM)
+    task, plant = task_of(PENDULUM)
     y, cost = table.observations.astype(np.float64), table.costs.astype(np.float64)
     angle, speed = np.mod(np.arctan2(y[:, 1], y[:, 0]), 2 * np.pi), y[:, 2]
     assert learner.value_function is not None
-    horizontal, vertical, value = on_plane(task, labels, learner.value_function.predict, 241)
+    horizontal, vertical, value = on_plane(task, plane_of(plant), learner.value_function.predict, 241)
     figure = new_figure(PAGE_WIDTH, 2.75)
     left, right = figure.subplots(1, 2, sharey=True)
     dots = left.scatter(angle, speed, 3.0, np.maximum(cost, 0.02), cmap="cividis", norm=LogNorm(0.02, 20.0), lw=0)

@@ -24,6 +24,7 @@ from rich.segment import Segment
 from typer.core import TyperGroup
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError, visible
+from mpcoffline.envs import PLANTS, ControlTask
 
 from .others import AddedCommand, added_commands
 
@@ -50,12 +51,7 @@ console = SafeConsole()
 messages = SafeConsole(stderr=True, soft_wrap=True, highlight=False)
 
 
-class Task(StrEnum):
-    """The tasks with a nominal controller."""
-
-    linear = "linear"
-    pendulum = "pendulum"
-    cartpole = "cartpole"
+Task = StrEnum("Task", {plant.name: plant.name for plant in PLANTS.values()})  # type: ignore[misc]
 
 
 class ValueForm(StrEnum):
@@ -198,12 +194,10 @@ def made_environment(env_id: str, alpha: float | None, start: Start | None) -> E
     """The environment; options that it does not know are refused before anything is solved."""
     import gymnasium as gym
 
-    from mpcoffline.envs import ENV_IDS, ControlTask
-
     try:
         env: Env[Any, Any] = gym.make(env_id) if alpha is None else gym.make(env_id, alpha=alpha)
     except gym.error.UnregisteredEnv as error:
-        nearest = difflib.get_close_matches(env_id, ENV_IDS, n=1, cutoff=0.3)
+        nearest = difflib.get_close_matches(env_id, [plant.id for plant in PLANTS.values()], n=1, cutoff=0.3)
         hint = f"Did you mean {nearest[0]!r}?" if nearest else ""
         raise UnknownIdError("--env", expected="a registered environment", actual=repr(env_id), hint=hint) from error
     except TypeError as error:

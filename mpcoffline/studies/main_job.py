@@ -49,14 +49,14 @@ def run_task(
 
     MPC_1 is the nominal controller (wrong model, nominal cost). One value function is learned, (VALUE), and from it the
     cost, (FIT) with a fixed model: MPC_2, and cost and model together: MPC_3. All run from the same starts, two thirds
-    of the swing-ups' broad and one third hanging, next to a reference: the closed-loop optimum in the linear task,
-    MPC_1 with the true model in the swing-ups.
+    of the swing-ups' broad and one third hanging, next to the plant's reference: the closed-loop optimum in the linear
+    task, MPC_1 with the true model in the others.
 
     The output folder receives ``results.json``, ``results.md``, ``results.csv``, ``figure.pdf``, ``figure.png``, and in
     ``controllers/`` the saved policies and learners; existing files of these names are replaced.
 
     Args:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         alpha: Size of the model error.
         seed: Seeds the model error, the learning and the starts.
         dataset: Minari id of the data; the task's DDPG data by default.

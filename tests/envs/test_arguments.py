@@ -16,7 +16,7 @@ from mpcoffline.envs import ENV_IDS, CartPoleSwingUpEnv, ControlTask, LinearTrac
 from mpcoffline.envs.base import wrap_angle
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
+LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 
 
 def make(env_id: str, **kwargs: Any) -> ControlTask:

@@ -14,7 +14,7 @@ from mpcoffline.envs import ENV_IDS, ControlTask
 from mpcoffline.envs.base import wrap_angle
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
+LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 SCALES = {LINEAR: [0.1, 0.2, 0.3, 0.4], PENDULUM: [0.1, 0.2], CARTPOLE: [0.1, 0.2, 0.3, 0.4]}
 
 

@@ -17,7 +17,7 @@ from mpcoffline.envs import ENV_IDS, ControlTask
 from mpcoffline.envs import rendering as style
 from mpcoffline.envs.rendering import Canvas, refined, signed, ticks
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
+LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 CAPTION = 44
 HANG = float(np.pi)
 

@@ -14,7 +14,7 @@ from mpcoffline.envs import ENV_IDS
 from mpcoffline.envs.pendulum_swing_up import PendulumSwingUpVectorEnv
 from mpcoffline.envs.vector import ControlTaskVectorEnv
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
+LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 MODES = ("NextStep", "SameStep", "Disabled")
 NOISE: dict[str, Any] = {"process_noise": 0.02, "measurement_noise": 0.05}
 CASES = [

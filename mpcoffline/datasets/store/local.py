@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mpcoffline.core.errors import FileFormatError, MPCOfflineError, UnknownIdError
-from mpcoffline.datasets.recipes import TASKS, Recipe, catalog_file
+from mpcoffline.datasets.recipes import Recipe, catalog_file, recorded_tasks
 
 from .ids import dataset_path, is_local, is_valid_id
 from .manifest import MANIFEST, parse_manifest, sha256_of
@@ -66,9 +66,9 @@ def list_datasets() -> list[DatasetRow]:
         name: DatasetRow(name, "local", metadata["total_episodes"], metadata["total_steps"])
         for name, metadata in local_datasets().items()
     }
-    for name, file in shipped_datasets().items():
+    for name, task in shipped_datasets().items():
         if name not in rows:
-            with importlib.resources.as_file(catalog_file(file)) as path:
+            with importlib.resources.as_file(catalog_file(f"{task}.h5", task)) as path:
                 rows[name] = DatasetRow(name, "shipped", *packed_size(path))
     return [rows[name] for name in sorted(rows)]
 
@@ -114,15 +114,17 @@ def _stored_ids(folder: Path, prefix: str, above: set[str]) -> Iterator[str]:
 
 
 def shipped_datasets() -> dict[str, str]:
-    """The shipped data sets: Minari id to the name of the packed file in the catalogue."""
-    return {Recipe.load(task).dataset_id: f"{task}.h5" for task in TASKS if catalog_file(f"{task}.h5").is_file()}
+    """The shipped data sets: Minari id to the name of the task, and so of the packed file in its catalogue."""
+    packed = [task for task in recorded_tasks() if catalog_file(f"{task}.h5", task).is_file()]
+    return {Recipe.load(task).dataset_id: task for task in packed}
 
 
 def _unpacked(dataset_id: str) -> MinariDataset:
     """Puts a shipped data set into the store, after checking that its file is the one that was shipped."""
-    file = shipped_datasets()[dataset_id]
-    expected = parse_manifest(catalog_file(MANIFEST).read_bytes()).get(file, "(none listed)")
-    with importlib.resources.as_file(catalog_file(file)) as path:
+    task = shipped_datasets()[dataset_id]
+    file = f"{task}.h5"
+    expected = parse_manifest(catalog_file(MANIFEST, task).read_bytes()).get(file, "(none listed)")
+    with importlib.resources.as_file(catalog_file(file, task)) as path:
         if (actual := sha256_of(path)) != expected:
             raise FileFormatError(
                 f"shipped file {path}", expected=f"sha256 {expected}", actual=actual, hint="Reinstall mpcoffline."

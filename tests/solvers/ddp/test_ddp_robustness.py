@@ -16,7 +16,7 @@ from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import DDPSolver, IpoptSolver, Plan, Solution
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
+LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 
 
 def honest(mpc: MPC, x: np.ndarray, solution: Solution, theta: np.ndarray | None = None) -> None:

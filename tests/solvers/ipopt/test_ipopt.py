@@ -21,7 +21,7 @@ from mpcoffline.solvers import IpoptSolver, Plan, Solution
 from mpcoffline.solvers.linear_quadratic import is_convex
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
+LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 
 
 @cache
