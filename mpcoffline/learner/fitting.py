@@ -9,7 +9,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -207,7 +207,7 @@ class Fit:
         described = {
             "nominal": self._nominal.to_json(),
             "groups": self._groups,
-            "config": asdict(self._config),
+            "config": self._config.to_json(),
             "seed": self._seed,
         }
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())

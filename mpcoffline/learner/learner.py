@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +15,7 @@ from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning import FitResult, ValueFunction
+from mpcoffline.learning import FitResult, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 
 from .checkpoint import Checkpoint, History, history_from_json
@@ -62,8 +61,8 @@ class OfflineMPCLearner:
             the published recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon,
             ``"best"`` the longest.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
-        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"`` or ``"auto"``; overrides the
-            preset.
+        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
+            ``mpcoffline.learning.VALUE_METHODS``, or a method itself; overrides the preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
         device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
         **overrides: Any field of :class:`~mpcoffline.learner.LearnerConfig`, ``ValueConfig`` or ``FitConfig``, e.g.
@@ -82,7 +81,7 @@ class OfflineMPCLearner:
         preset: str = "default",
         seed: int = 0,
         *,
-        value: str | None = None,
+        value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
         device: str = "cpu",
         **overrides: Any,
@@ -254,7 +253,12 @@ class OfflineMPCLearner:
         return table, space if isinstance(space, spaces.Box) else None
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz."""
+        """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz.
+
+        Raises:
+            InvalidArgumentError: For an MPC that has no JSON form, or a value method whose class is not registered;
+                nothing is written then.
+        """
         space = self._observation_space
         document = {
             "nominal": self.nominal_mpc.to_json(),
@@ -264,7 +268,7 @@ class OfflineMPCLearner:
             "value_given": self._given_value_function is not None,
             "seed": self.seed,
             "device": self.device,
-            "config": asdict(self.config),
+            "config": self.config.to_json(),
             "history": self.history,
             "result": None if self.result is None else self.result.to_json(),
             "observation_space": None if space is None else box_to_json(space),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -97,11 +97,15 @@ class LearnerConfig:
         changed = {prefix: replace(part, **changes[prefix]) for prefix, part in parts.items()}
         return replace(self, **changes[""], **changed)
 
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description; raises as ``ValueConfig.to_json``."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        return own | {"value": self.value.to_json(), "fit": asdict(self.fit)}
+
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> LearnerConfig:
-        """From ``dataclasses.asdict`` of one, after a journey through JSON."""
-        value = data["value"] | {"hidden": tuple(data["value"]["hidden"])}
-        return cls(**(dict(data) | {"value": ValueConfig(**value), "fit": FitConfig(**data["fit"])}))
+        """The inverse of ``to_json``."""
+        return cls(**(dict(data) | {"value": ValueConfig.from_json(data["value"]), "fit": FitConfig(**data["fit"])}))
 
 
 # Half of the terminal cost is a convex quadratic: a network alone has local minima, to which short plans fall.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from .bellman.regression import FitConfig, FitResult, ParameterTraining, fit_parameters
 from .terminal import DistillConfig, TerminalError, fit_terminal, terminal_error
-from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
+from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueMethod, ValueTraining, fit_value
 from .value.noise import Stochasticity, estimate_stochasticity
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "TerminalError",
     "ValueConfig",
     "ValueFunction",
+    "ValueMethod",
     "ValueTraining",
     "estimate_stochasticity",
     "fit_parameters",

@@ -124,7 +124,7 @@ def run_task(
         seed=seed,
         env_id=setup.env_id,
         dataset_id=str(data.spec.dataset_id),
-        value=learners["MPC_2"][0].config.value.method,
+        value=str(learners["MPC_2"][0].config.value.method),
         discount=setup.nominal.discount,
         dt=setup.nominal.model.dt,
         starts=starts,

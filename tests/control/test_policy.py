@@ -415,7 +415,7 @@ def test_a_policy_whose_solver_no_file_can_name_is_not_saved(tmp_path: Path) -> 
 
     mpc = short_pendulum()
     policy = MPCPolicy(mpc, Mine(mpc))
-    with pytest.raises(InvalidArgumentError, match="solver: expected one that is registered, .* got Mine"):
+    with pytest.raises(InvalidArgumentError, match=r"solver: expected one that is registered, .* got Mine"):
         policy.save(tmp_path / "policy.zip")
     assert list(tmp_path.iterdir()) == []
 

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from typing import Any
 
 from mpcoffline.core.checks import check_integers, check_known, check_number
 from mpcoffline.core.errors import InvalidArgumentError
 
-from .methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
-
-# The loss of each name, given the expectile tau.
-_LOSSES: dict[str, Callable[[float], ValueMethod]] = {
-    "residual": lambda tau: Residual(),
-    "td": lambda tau: TemporalDifference(),
-    "expectile": Expectile,
-    "iql": ImplicitQ,
-}
-VALUE_METHODS = (*_LOSSES, "auto")
+from .methods import VALUE_METHODS, ValueMethod, check_tau
 
 
 @dataclass(frozen=True)
@@ -26,10 +18,10 @@ class ValueConfig:
     """How V_phi is learned.
 
     Attributes:
-        method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, ``"iql"`` for noisy plants, or
-            ``"auto"``: ``"iql"`` where the data are noisy
-            (:func:`~mpcoffline.learning.estimate_stochasticity`), else ``"expectile"``.
-        tau: The expectile, for ``"expectile"`` and ``"iql"``.
+        method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, ``"iql"`` for noisy plants, another
+            name in ``VALUE_METHODS``, or ``"auto"``: ``"iql"`` where the data are noisy
+            (:func:`~mpcoffline.learning.estimate_stochasticity`), else ``"expectile"``; or a method itself.
+        tau: The expectile of methods that are named and have one, as ``"expectile"`` and ``"iql"``.
         n_steps: Gradient steps.
         batch_size: Transitions a step.
         learning_rate: Adam's at the start; falls to zero on a cosine.
@@ -41,7 +33,7 @@ class ValueConfig:
         patience: Steps without a smaller validation loss after which learning stops; 0 for never.
     """
 
-    method: str = "residual"
+    method: str | ValueMethod = "residual"
     tau: float = 0.3
     n_steps: int = 8_000
     batch_size: int = 256
@@ -53,9 +45,9 @@ class ValueConfig:
     patience: int = 2_000
 
     def __post_init__(self) -> None:
-        check_known("value method", self.method, VALUE_METHODS)
-        if not 0.0 < self.tau < 1.0:
-            raise InvalidArgumentError("tau", expected="a number in (0, 1)", actual=str(self.tau))
+        if not isinstance(self.method, ValueMethod):
+            check_known("value method", self.method, ("auto", *VALUE_METHODS))
+        check_tau(self.tau)
         check_integers(1, n_steps=self.n_steps, batch_size=self.batch_size, n_members=self.n_members)
         check_integers(1, **{f"hidden[{i}]": width for i, width in enumerate(self.hidden)})
         check_integers(0, patience=self.patience)
@@ -69,8 +61,45 @@ class ValueConfig:
         Args:
             noisy: What ``"auto"`` goes by.
         """
-        name = ("iql" if noisy else "expectile") if self.method == "auto" else self.method
-        return _LOSSES[name](self.tau)
+        if isinstance(self.method, ValueMethod):
+            return self.method
+        kind: Any = VALUE_METHODS[("iql" if noisy else "expectile") if self.method == "auto" else self.method]
+        method: ValueMethod = kind(tau=self.tau) if hasattr(kind, "tau") else kind()
+        return method
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description; of a method itself, its name and its fields.
+
+        Raises:
+            InvalidArgumentError: For a method whose class is not registered or no dataclass: no file can hold it.
+        """
+        data = {f.name: getattr(self, f.name) for f in fields(self)} | {"hidden": list(self.hidden)}
+        if not isinstance(self.method, str):
+            method: Any = self.method
+            name = VALUE_METHODS.name_of(type(method))
+            if not name or not is_dataclass(type(method)):
+                raise InvalidArgumentError(
+                    "value method",
+                    expected="a registered dataclass, which a file can hold",
+                    actual=repr(method)[:200],
+                    hint="Register its class: VALUE_METHODS.register of mpcoffline.learning.",
+                )
+            data["method"] = {"kind": name} | asdict(method)
+        return data
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> ValueConfig:
+        """The inverse of ``to_json``.
+
+        Raises:
+            FileFormatError: For a method that nobody has registered.
+        """
+        method: Any = data["method"]
+        if isinstance(method, dict):
+            options = dict(method)
+            kind: Any = VALUE_METHODS.of_file(options.pop("kind", None), "value method")
+            method = kind(**options)
+        return cls(**(dict(data) | {"hidden": tuple(data["hidden"]), "method": method}))
 
 
 def cosine(step: int, n_steps: int) -> float:
