@@ -54,16 +54,6 @@ messages = SafeConsole(stderr=True, soft_wrap=True, highlight=False)
 Task = StrEnum("Task", {plant.name: plant.name for plant in PLANTS.values()})  # type: ignore[misc]
 
 
-class ValueForm(StrEnum):
-    """The methods of (VALUE), ``mpcoffline.learning.VALUE_METHODS``."""
-
-    residual = "residual"
-    td = "td"
-    expectile = "expectile"
-    iql = "iql"
-    auto = "auto"
-
-
 class Preset(StrEnum):
     """The presets of a learner, ``mpcoffline.learner.presets.PRESETS``."""
 
@@ -80,6 +70,31 @@ class Start(StrEnum):
     hanging = "hanging"
 
 
+def _checked_value(given: str | None) -> str | None:
+    """Refuses what is no method of (VALUE); torch is imported where there is one to look at."""
+    if given is not None:
+        from mpcoffline.core.checks import check_known
+
+        check_known("--value", given, _value_methods())
+    return given
+
+
+def _value_methods() -> list[str]:
+    from mpcoffline.learning import VALUE_METHODS
+
+    return ["auto", *VALUE_METHODS]
+
+
+Value = Annotated[
+    str | None,
+    typer.Option(
+        help="Method of (VALUE), e.g. residual, the published one, or auto.",
+        metavar="METHOD",
+        show_default="the preset's",
+        callback=_checked_value,
+        autocompletion=_value_methods,
+    ),
+]
 TaskArgument = Annotated[Task, typer.Argument(help="Which task.", show_default=False)]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 Alpha = Annotated[

@@ -17,7 +17,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction
+from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 
 from .checkpoint import Checkpoint, History, history_from_json
@@ -65,8 +65,8 @@ class OfflineMPCLearner:
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
-        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"`` or ``"auto"``; overrides the
-            preset.
+        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
+            ``mpcoffline.learning.VALUE_METHODS``, or a method itself; overrides the preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
         device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
         **options: Any option of the method, e.g. ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; what two stages
@@ -90,7 +90,7 @@ class OfflineMPCLearner:
         seed: int = 0,
         *,
         method: str | Method | None = None,
-        value: str | None = None,
+        value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
         device: str = "cpu",
         **options: Any,
@@ -271,7 +271,8 @@ class OfflineMPCLearner:
         """Writes nominal and learned MPC, value function, method and history to a zip of JSON and npz.
 
         Raises:
-            InvalidArgumentError: For a learning method that is not registered; nothing is written.
+            InvalidArgumentError: For an MPC that has no JSON form, or a learning or value method that is not
+                registered; nothing is written then.
             StorageError: If it cannot be written.
         """
         space = self._observation_space
@@ -281,7 +282,7 @@ class OfflineMPCLearner:
             "learn": self.learn,
             "preset": self.preset,
             "method": self.method.name,
-            "options": self.method.options,
+            "options": self.method.to_json(),
             "value_given": self._given_value_function is not None,
             "seed": self.seed,
             "device": self.device,

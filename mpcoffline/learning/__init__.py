@@ -9,7 +9,7 @@ from .method import METHODS, Method
 from .paper import Paper
 from .stages import FitResult, Known, Stage
 from .terminal import DistillConfig, TerminalError, fit_terminal, terminal_error
-from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
+from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueMethod, ValueTraining, fit_value
 from .value.noise import Stochasticity, estimate_stochasticity
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "TerminalError",
     "ValueConfig",
     "ValueFunction",
+    "ValueMethod",
     "ValueTraining",
     "estimate_stochasticity",
     "fit_parameters",

@@ -17,6 +17,7 @@ from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
 from .stages import Stage
+from .value.methods import ValueMethod, method_to_json
 
 _log = logging.getLogger(__name__)
 
@@ -83,6 +84,17 @@ class Method(ABC):
         return {
             name: getattr(getattr(self, stage) if stage else self, field)
             for name, (stage, field) in self._homes().items()
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as a file has them, for :meth:`replaced`.
+
+        Raises:
+            InvalidArgumentError: For a value method of one's own that no file can hold.
+        """
+        return {
+            name: method_to_json(value) if isinstance(value, ValueMethod) else value
+            for name, value in self.options.items()
         }
 
     def replaced(self, options: Mapping[str, Any]) -> Self:

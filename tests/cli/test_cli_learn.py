@@ -14,10 +14,10 @@ from typer.testing import CliRunner, Result
 
 import mpcoffline
 from mpcoffline import MPCPolicy, OfflineMPCLearner, nominal_mpc
-from mpcoffline.cli.common import Preset, ValueForm
+from mpcoffline.cli.common import Preset
 from mpcoffline.cli.main import app
 from mpcoffline.learner.presets import PRESETS
-from mpcoffline.learning import VALUE_METHODS, Bellman
+from mpcoffline.learning import Bellman
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 DATA = "mpcoffline/pendulum/ddpg-v0"
@@ -41,7 +41,6 @@ def call(*arguments: str) -> Result:
 
 
 def test_the_choices_are_those_of_the_library() -> None:
-    assert [form.value for form in ValueForm] == list(VALUE_METHODS)
     assert [preset.value for preset in Preset] == list(PRESETS)
 
 

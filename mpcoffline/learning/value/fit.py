@@ -5,9 +5,9 @@ from __future__ import annotations
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning.progress import OnEpoch, silent
 
-from .config import VALUE_METHODS, ValueConfig, cosine
+from .config import ValueConfig, cosine
 from .function import ValueFunction
-from .methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
+from .methods import VALUE_METHODS, Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
 from .noise import Stochasticity, estimate_stochasticity
 from .training import ValueTraining
 

@@ -41,7 +41,11 @@ def same_arrays(found: dict[str, NDArray[Any]], wanted: dict[str, NDArray[Any]])
 
 @pytest.mark.parametrize(
     "options",
-    [*({"method": method} for method in VALUE_METHODS), {"n_members": 2}, {"validation": 0.3, "n_steps": 400}],
+    [
+        *({"method": method} for method in ("auto", *VALUE_METHODS)),
+        {"n_members": 2},
+        {"validation": 0.3, "n_steps": 400},
+    ],
 )
 @pytest.mark.parametrize("stop", [0, 7, 290])
 def test_an_interrupted_training_ends_with_the_same_bits(options: dict[str, Any], stop: int) -> None:
@@ -244,7 +248,7 @@ def test_units_of_the_state_and_constant_columns_do_not_matter() -> None:
     assert lq_plant.explained(truth, value.predict(widened(GRID))) > 0.98
 
 
-@pytest.mark.parametrize("method", VALUE_METHODS)
+@pytest.mark.parametrize("method", ["auto", *VALUE_METHODS])
 def test_fewer_rows_than_a_batch_are_enough(method: str) -> None:
     config = ValueConfig(method=method, tau=0.5, hidden=(32, 32), n_steps=400, learning_rate=1e-2, polyak=0.1)
     value = fit_value(lq_plant.policy_log(100), lq_plant.DISCOUNT, config, seed=0)
