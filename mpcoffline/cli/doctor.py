@@ -46,7 +46,7 @@ class Check(NamedTuple):
     advice: str = ""
 
 
-def diagnosis() -> dict[str, Any]:
+def checkup() -> dict[str, Any]:
     """Examines versions, compiler, solvers, data sets, GPU and threads.
 
     Nothing is raised: what breaks is a check that says so.

@@ -74,9 +74,9 @@ def doctor(as_json: Json = False) -> None:
 
     Exit code 1 if something that is needed is broken.
     """
-    from .doctor import diagnosis
+    from .doctor import checkup
 
-    found = diagnosis()
+    found = checkup()
     if as_json:
         print_json(found)
     else:

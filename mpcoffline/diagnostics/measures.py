@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import scipy.spatial
@@ -11,11 +12,13 @@ import torch
 
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
+from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.learning.bellman.equation import BellmanProblem, variance_of
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.features import RandomFeatures, Ridge
+from mpcoffline.mpc.coordinates import Coordinates
+from mpcoffline.mpc.parameters import Group
 
 _ROWS = 10_000
 _TREE_ROWS = 5_000
@@ -244,11 +247,6 @@ def goal_share(table: TransitionTable, reference: Array) -> float:
 
 def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
     """Parameters on a bound that were not on it before; the zeros of a matrix factor's diagonal are no bounds."""
-    names = []
-    factors = {name for block in mpc.space if block.kind == "psd" for name in block.coordinate_names}
-    before = dict(zip(nominal.space.names, nominal.theta, strict=True))
-    for name, value, low, high in zip(mpc.space.names, mpc.theta, mpc.space.low, mpc.space.high, strict=True):
-        near = 1e-6 * (1.0 + abs(value))
-        if name not in factors and (value - low < near or high - value < near) and before.get(name) != value:
-            names.append(name)
-    return tuple(names)
+    before, after = (dict(zip(m.space.names, m.theta, strict=True)) for m in (nominal, mpc))
+    on_bounds = Coordinates(mpc, get_args(Group)).at_bounds(mpc.theta)
+    return tuple(name for name in on_bounds if before.get(name) != after[name])

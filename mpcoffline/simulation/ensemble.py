@@ -9,11 +9,10 @@ import torch
 
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import Identification, OneStepProblem, Transitions, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
-
-from .features import RandomFeatures, Ridge
 
 _BOOTSTRAP_ROWS = 3_000
 _N_FEATURES = 100
@@ -150,6 +149,6 @@ def _missed(problem: OneStepProblem, z: Array, rng: np.random.Generator) -> _Res
     rows = problem.rows
     missed = -problem.errors(problem.theta(z)) * problem.scale
     inputs = np.hstack([rows.x, rows.u])
-    features = RandomFeatures(inputs, _N_FEATURES, rng, quadratic=False)
+    features = RandomFeatures(inputs, _N_FEATURES, rng, multiplied=0)
     regression = Ridge.fit(features(inputs), missed, _RESIDUAL_RIDGE)
     return _Residual(features, regression, np.quantile(np.abs(missed), 0.999, axis=0))

@@ -6,8 +6,7 @@ import numpy as np
 
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-
-from .features import RandomFeatures, Ridge
+from mpcoffline.estimation.features import RandomFeatures, Ridge
 
 _ROWS = 20_000
 _N_FEATURES = 400

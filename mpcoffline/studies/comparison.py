@@ -35,7 +35,7 @@ FIRST_START = 50_000  # seeds of the starts; nothing was tuned on them
 
 
 @dataclass(frozen=True)
-class Group:
+class CaseGroup:
     """Cases of one task that share the data, and so the value functions, which are learned in the first case.
 
     Attributes:
@@ -74,7 +74,7 @@ class Row:
     """One controller in one case: means over the starts.
 
     Attributes:
-        group: Name of the :class:`Group`.
+        group: Name of the :class:`CaseGroup`.
         alpha: Size of the model error, or of the linear plant's.
         seed: Seed of the model error.
         controller: Its name.
@@ -100,7 +100,7 @@ class Row:
 class _Arena:
     """Where controllers meet: a setup and its starts."""
 
-    group: Group
+    group: CaseGroup
     setup: Setup
     n_episodes: int
     actions: list[NDArray[np.float64]] = field(default_factory=list)
@@ -131,7 +131,7 @@ class _Arena:
         return Row(*case, name, float(cost), float(discounted), None if up is None else float(up), *rest)
 
 
-def run_group(group: Group, n_episodes: int) -> list[Row]:
+def run_group(group: CaseGroup, n_episodes: int) -> list[Row]:
     """Learns and runs all controllers in all cases of a group.
 
     Args:
@@ -231,7 +231,7 @@ def without(nominal: MPC, name: str, value: float) -> MPC:
 
 def groups(
     data_seeds: Sequence[int] = (0, 1, 2), model_seeds: Sequence[int] = range(5), alphas: Sequence[float] = (0.5, 1.0)
-) -> list[Group]:
+) -> list[CaseGroup]:
     """The cases of the study.
 
     The swing-ups at alpha = 1.5 for all model errors and data sets, at other alphas, under noise and with a mismatched
@@ -239,12 +239,12 @@ def groups(
     """
     first, large = data_seeds[0], tuple((1.5, seed) for seed in model_seeds)
     small = ((0.0, 0), *((alpha, seed) for alpha in alphas for seed in model_seeds[:2]))
-    found: list[Group] = []
+    found: list[CaseGroup] = []
     published = [plant for plant in PLANTS.values() if plant.published]
     for task in (plant.name for plant in published if plant.max_alpha is None):
-        found += [Group(task, seed, "clean", large + (small if seed == first else ())) for seed in data_seeds]
-        found += [Group(task, first, "noise", large[:3]), Group(task, first, "mismatch", large[:3])]
+        found += [CaseGroup(task, seed, "clean", large + (small if seed == first else ())) for seed in data_seeds]
+        found += [CaseGroup(task, first, "noise", large[:3]), CaseGroup(task, first, "mismatch", large[:3])]
     for task in (plant.name for plant in published if plant.max_alpha is not None):
-        found += [Group(task, first, "clean", ((alpha, 0),)) for alpha in (0.0, 0.5, 1.0, 1.5, 2.0)]
-        found += [Group(task, seed, "clean", ((1.0, 0),)) for seed in data_seeds[1:]]
+        found += [CaseGroup(task, first, "clean", ((alpha, 0),)) for alpha in (0.0, 0.5, 1.0, 1.5, 2.0)]
+        found += [CaseGroup(task, seed, "clean", ((1.0, 0),)) for seed in data_seeds[1:]]
     return found

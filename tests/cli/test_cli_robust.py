@@ -52,7 +52,7 @@ LONG = {
     "mpcoffline.control.export.export_c": ["export", "policy.zip"],
     "mpcoffline.datasets.replay": ["datasets", "replay", "mpcoffline/pendulum/ddpg-v0"],
     "mpcoffline.datasets.download_dataset": ["datasets", "download", "mine/plant/log-v0"],
-    "mpcoffline.cli.doctor.diagnosis": ["doctor"],
+    "mpcoffline.cli.doctor.checkup": ["doctor"],
 }
 
 

@@ -61,7 +61,7 @@ def test_a_compiler_that_fails_is_found_out(monkeypatch: pytest.MonkeyPatch, tmp
     broken.write_text("#!/bin/sh\necho no licence >&2\nexit 3\n")
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
-    first, second = doctor.diagnosis()["checks"]
+    first, second = doctor.checkup()["checks"]
     assert first["status"] == "warn"
     assert "no licence" in first["found"]
     assert (second["name"], second["status"]) == ("C compiler", "ok")  # which takes its place
@@ -80,7 +80,7 @@ def test_the_cache_with_its_size_and_whether_it_is_usable(
         (tmp_path / "cache" / "tables").mkdir(parents=True)
         (tmp_path / "cache").chmod(0o777 if kind == "shared" else 0o700)
         (tmp_path / "cache" / "tables" / "rows").write_bytes(bytes(5_000_000))
-    (check,) = doctor.diagnosis()["checks"]
+    (check,) = doctor.checkup()["checks"]
     size = 5 if kind in ("there", "shared") else 0
     assert check["found"].startswith(f"{tmp_path}/cache, {size} MB of at most 3000")
     assert check["status"] == ("ok" if kind in ("absent", "there") else "warn")
@@ -113,7 +113,7 @@ def test_a_needed_package_that_is_too_old_fails(monkeypatch: pytest.MonkeyPatch)
 def test_missing_optional_packages_name_their_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     only(monkeypatch, "_optional_packages")
     monkeypatch.setattr(doctor, "_version", lambda _: None)
-    found = doctor.diagnosis()
+    found = doctor.checkup()
     assert found["ok"] is True
     assert 'pip install "mpcoffline[render]"' in by_name(found)["pygame"]["advice"]
 
@@ -129,6 +129,6 @@ def test_what_breaks_unforeseen_is_a_failed_check(monkeypatch: pytest.MonkeyPatc
         raise RuntimeError("driver lost")
 
     monkeypatch.setattr(doctor, "_EXAMINATIONS", (_hardware,))
-    found = doctor.diagnosis()
+    found = doctor.checkup()
     assert found["ok"] is False
     assert by_name(found)["hardware"]["found"] == "RuntimeError: driver lost"

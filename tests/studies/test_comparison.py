@@ -8,7 +8,7 @@ import torch
 
 from mpcoffline.learner.presets import PRESETS
 from mpcoffline.plants.nominal import nominal_mpc
-from mpcoffline.studies.comparison import Group, Row, groups, run_group, without
+from mpcoffline.studies.comparison import CaseGroup, Row, groups, run_group, without
 
 BRIEF = {
     "value_n_steps": 200,
@@ -30,7 +30,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_every_controller_has_a_row_in_every_case() -> None:
-    group = Group("pendulum", 0, "clean", ((1.5, 0), (0.5, 1)))
+    group = CaseGroup("pendulum", 0, "clean", ((1.5, 0), (0.5, 1)))
     rows = run_group(group, n_episodes=3)
     cases = {(row.alpha, row.seed) for row in rows}
     assert cases == {(1.5, 0), (0.5, 1)}
@@ -47,7 +47,7 @@ def test_every_controller_has_a_row_in_every_case() -> None:
 
 @pytest.mark.slow
 def test_the_linear_task_is_compared_with_its_optimum() -> None:
-    rows = {row.controller: row for row in run_group(Group("linear", 0, "clean", ((1.0, 0),)), n_episodes=3)}
+    rows = {row.controller: row for row in run_group(CaseGroup("linear", 0, "clean", ((1.0, 0),)), n_episodes=3)}
     assert min(rows.values(), key=lambda row: row.discounted_cost).controller == "optimal"
 
 

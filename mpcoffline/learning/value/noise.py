@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.features import RandomFeatures
 
 Array = NDArray[np.float64]
 
@@ -16,7 +17,7 @@ Array = NDArray[np.float64]
 NOISY_CHANGE, NOISY_COST = 0.5, 0.1
 _MIN_ROWS, _MAX_ROWS = 10, 20_000
 _FEATURES = 300
-_MULTIPLIED = 20  # coordinates
+_MULTIPLIED, _FLATTEST = 20, 0.2  # coordinates; slope, relative to the steepest
 _RIDGES = (1e-8, 1e-5, 1e-3, 1e-1)  # few rows need the large ones
 
 
@@ -65,7 +66,8 @@ def estimate_stochasticity(table: TransitionTable, *, seed: int = 0) -> Stochast
     half = len(rows) // 2
     if half < _MIN_ROWS:
         return Stochasticity(0.0, 0.0)
-    shares = _unexplained(_features(_standardised(x), rng), _standardised(y), half)
+    features = RandomFeatures(x, _FEATURES, rng, multiplied=_MULTIPLIED, flattest=_FLATTEST)
+    shares = _unexplained(features(x), _standardised(y), half)
     changes = shares[:-1][np.ptp(y[:, :-1], axis=0) > 0.0]
     return Stochasticity(float(changes.mean()) if len(changes) else 0.0, float(shares[-1]))
 
@@ -73,14 +75,6 @@ def estimate_stochasticity(table: TransitionTable, *, seed: int = 0) -> Stochast
 def _standardised(x: Array) -> Array:
     std = x.std(axis=0)
     return np.asarray((x - x.mean(axis=0)) / np.where(std > 0.0, std, 1.0))
-
-
-def _features(x: Array, rng: np.random.Generator) -> Array:
-    """1, x, the products of its coordinates, and random features of it at slopes from flat to steep."""
-    slopes = rng.normal(size=(x.shape[1], _FEATURES)) * rng.uniform(0.2, 1.0, size=_FEATURES)
-    waves = np.tanh(x @ slopes + rng.uniform(-2.0, 2.0, size=_FEATURES))
-    i, j = np.triu_indices(min(x.shape[1], _MULTIPLIED))
-    return np.hstack([np.ones((len(x), 1)), x, x[:, i] * x[:, j], waves])
 
 
 def _unexplained(features: Array, y: Array, half: int) -> Array:

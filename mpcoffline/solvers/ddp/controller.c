@@ -52,21 +52,16 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
         if (!(J[c] < INFINITY)) J[c] = INFINITY;
     }
     for (int l = 0; l < MPC_STARTS; ++l) {
-        cheapest[l] = l * N_CANDIDATES / MPC_STARTS;
-        for (int c = cheapest[l]; c < (l + 1) * N_CANDIDATES / MPC_STARTS; ++c)
-            if (J[c] < J[cheapest[l]]) cheapest[l] = c;
+        cheapest[l] = (int)start_of(l, MPC_STARTS, J, N_CANDIDATES);
         start(m, w, cheapest[l]);
         raced[l] = w->J;
     }
     choose_finalists(raced, MPC_STARTS, chosen);
     for (int l = 0; l < FINALISTS(MPC_STARTS); ++l) {
         start(m, w, cheapest[chosen[l]]);
-        int status = solve(m, w), converged = status == CONVERGED, best_converged = best_status == CONVERGED;
+        int status = solve(m, w);
         if (status == NOT_FINITE) continue;
-        /* A converged solution that is as good as the best goes before one that is not. */
-        double slack = BEATEN * (1.0 + fabs(best));
-        int closer = converged && !best_converged && w->J < best + slack;
-        if (closer || w->J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY)) {
+        if (goes_before(w->J, status == CONVERGED, best, best_status == CONVERGED)) {
             best = w->J;
             best_status = status;
             keep(state->x, state->u, w->x, w->u);

@@ -384,6 +384,21 @@ static inline void choose_finalists(const double *J, int64_t n, int64_t *chosen)
         }
 }
 
+/* The start of a share of the candidates: its cheapest one, which keeps the starts different. */
+static inline int64_t start_of(int64_t share, int64_t n_starts, const double *J, int64_t n_candidates) {
+    int64_t cheapest = share * n_candidates / n_starts;
+    for (int64_t c = cheapest; c < (share + 1) * n_candidates / n_starts; ++c)
+        if (J[c] < J[cheapest]) cheapest = c;
+    return cheapest;
+}
+
+/* Whether a plan of cost J goes before the best so far: a converged one that is as good goes before one that is not. */
+static inline int goes_before(double J, int converged, double best, int best_converged) {
+    double slack = BEATEN * (1.0 + (best < 0 ? -best : best));
+    int closer = converged && !best_converged && J < best + slack;
+    return closer || J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY);
+}
+
 /* Takes over the new trajectory where the mask says so. */
 static void accept(const mpc_problem *m, lanes *w, vl mask) {
     w->J = vd_select(mask, w->J_new, w->J);

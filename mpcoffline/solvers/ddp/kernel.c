@@ -170,17 +170,14 @@ int mpc_solve(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t s
     return 0;
 }
 
-/* Takes the start of each share of the candidates, its cheapest one; shares of one need no comparison. */
+/* Takes the start of each share of the candidates; shares of one need no costs. */
 static void choose_starts(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
                           int64_t n_candidates, double *J, lanes *w, mpc_batch *starts) {
     int64_t N = m->horizon;
     const double *u0 = b->u0 ? b->u0 + i * NU : NULL;
-    int compare = n_candidates > starts->n;
-    if (compare) candidate_costs(m, w, b->x0 + i * NX, starts->theta, u0, candidates, n_candidates, J);
+    if (n_candidates > starts->n) candidate_costs(m, w, b->x0 + i * NX, starts->theta, u0, candidates, n_candidates, J);
     for (int64_t l = 0; l < starts->n; ++l) {
-        int64_t cheapest = l * n_candidates / starts->n;
-        for (int64_t c = cheapest; compare && c < (l + 1) * n_candidates / starts->n; ++c)
-            if (J[c] < J[cheapest]) cheapest = c;
+        int64_t cheapest = start_of(l, starts->n, J, n_candidates);
         memcpy(starts->u + l * N * NU, candidates + cheapest * N * NU, N * NU * sizeof(double));
         memcpy((double *)starts->x0 + l * NX, b->x0 + i * NX, NX * sizeof(double));
         if (u0) memcpy((double *)starts->u0 + l * NU, u0, NU * sizeof(double));
@@ -216,8 +213,7 @@ static void race(const mpc_problem *m, mpc_batch *starts, lanes *w, int64_t *cho
     }
 }
 
-/* Cold solve of one problem. Each start is the cheapest of its share of the candidates, which keeps them different;
- * the best solution goes to row i of the batch. */
+/* Cold solve of one problem; the best solution goes to row i of the batch. */
 static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
                        int64_t n_candidates, double *J, lanes *w, mpc_batch *starts, int64_t *chosen) {
     int64_t N = m->horizon, best = 0, iterations = 0;
@@ -233,12 +229,8 @@ static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, cons
     solve_range(m, &finals, w, 0, 1);
     for (int64_t l = 0; l < finals.n; ++l) {
         iterations += starts->iterations[l];
-        /* A converged solution that is as good as the best goes before one that is not. */
-        double slack = BEATEN * (1.0 + (starts->J[best] < 0 ? -starts->J[best] : starts->J[best]));
-        int nearly = starts->J[l] < starts->J[best] + slack;
-        int closer = starts->status[l] == CONVERGED && starts->status[best] != CONVERGED && nearly;
-        int same = (starts->status[l] == CONVERGED) == (starts->status[best] == CONVERGED);
-        if (closer || (starts->J[l] < starts->J[best] - (same ? 0.0 : slack)) || !(starts->J[best] < INFINITY)) best = l;
+        int converged = starts->status[l] == CONVERGED, best_converged = starts->status[best] == CONVERGED;
+        if (goes_before(starts->J[l], converged, starts->J[best], best_converged)) best = l;
     }
     memcpy(b->u + i * N * NU, starts->u + best * N * NU, N * NU * sizeof(double));
     memcpy(b->x + i * (N + 1) * NX, starts->x + best * (N + 1) * NX, (N + 1) * NX * sizeof(double));

@@ -12,21 +12,32 @@ _RIDGE = 1e-7  # relative to the mean square of the features
 
 
 class RandomFeatures:
-    """1, x, all products of two entries of x, and hyperbolic tangents of random directions; x standardised.
+    """1, x, products of two entries of x, and hyperbolic tangents of random directions; x standardised.
 
     Args:
         x: Data that decide the scale, ``(n, d)``.
         n_random: Number of random directions.
         rng: Draws them.
-        quadratic: Whether products are among the features.
+        multiplied: How many entries have products, the first ones; all by default.
+        flattest: Slope of the flattest hyperbolic tangents, relative to the steepest; by default all are alike.
     """
 
-    def __init__(self, x: Array, n_random: int, rng: np.random.Generator, *, quadratic: bool = True) -> None:
+    def __init__(
+        self,
+        x: Array,
+        n_random: int,
+        rng: np.random.Generator,
+        *,
+        multiplied: int | None = None,
+        flattest: float = 1.0,
+    ) -> None:
         self._mean, spread = x.mean(axis=0), x.std(axis=0)
         self._spread = np.where(spread > 0.0, spread, 1.0)
         self._directions = rng.standard_normal((x.shape[1], n_random))
+        if flattest < 1.0:
+            self._directions *= rng.uniform(flattest, 1.0, n_random)
         self._offsets = rng.uniform(-2.0, 2.0, n_random)
-        self._pairs = np.triu_indices(x.shape[1]) if quadratic else (np.zeros(0, int), np.zeros(0, int))
+        self._pairs = np.triu_indices(x.shape[1] if multiplied is None else min(x.shape[1], multiplied))
 
     def __call__(self, x: Array) -> Array:
         """Features of x ``(n, d)``, ``(n, m)``."""
