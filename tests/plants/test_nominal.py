@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.plants.nominal import CARTPOLE_PARAMETERS, PENDULUM_PARAMETERS, nominal_mpc
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 SPREADS = {PENDULUM: PENDULUM_PARAMETERS, CARTPOLE: CARTPOLE_PARAMETERS}
 
 
