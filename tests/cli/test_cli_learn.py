@@ -44,6 +44,7 @@ def test_the_choices_are_those_of_the_library() -> None:
     assert [preset.value for preset in Preset] == list(PRESETS)
 
 
+@pytest.mark.usefixtures("shipped")
 def test_options_reach_the_fit_and_json_describes_it() -> None:
     result = call(
         *("learn", "--dataset", DATA, "--preset", "paper", "--value", "td", "--discount", "0.93", "--horizon", "7"),
@@ -63,6 +64,7 @@ def test_options_reach_the_fit_and_json_describes_it() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_an_interrupted_fit_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("learn", "--dataset", DATA, "--steps", "501", "--checkpoint", "fit.ckpt")  # an epoch has 500
     fit = OfflineMPCLearner.fit

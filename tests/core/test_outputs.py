@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpc_problems import PENDULUM
+from task_ids import PENDULUM
 
 from mpcoffline import MPCPolicy
 from mpcoffline.control.export import export_c

@@ -95,7 +95,7 @@ def test_ctrl_c_ends_all_processes_and_shows_one_traceback(tmp_path: Path) -> No
             # A shell that starts tests in the background leaves them deaf to Ctrl-C.
             signal.signal(signal.SIGINT, signal.default_int_handler)
             # One write a line: print may take two, between which that of the other process comes.
-            job = r"[__import__('os').write(1, b'started\n'), __import__('time').sleep(60.0)]"
+            job = r"[__import__('os').write(1, b'started\\n'), __import__('time').sleep(60.0)]"
             parallel.map(eval, [job, job], workers=2)
         """)
     )

@@ -14,10 +14,10 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.envs import ENV_IDS, ControlTask
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS[:3]
 A = [[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.8, 0.0], [0.0, 0.0, 0.0, 0.8]]
 
 PLANTS: dict[str, dict[str, Any]] = {

@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.envs import ENV_IDS, PLANTS
 from mpcoffline.plants.nominal import nominal_mpc
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = (PLANTS[name].id for name in ("linear", "pendulum", "cartpole"))
 SPREADS = {plant.id: [p for p in plant.parameters if p.spread] for plant in PLANTS.values()}
 UNCERTAIN = [env_id for env_id, parameters in SPREADS.items() if parameters]
 

@@ -38,6 +38,7 @@ def test_what_was_recorded_here_is_repeated_bit_for_bit(env_id: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_shipped_data_are_repeated() -> None:
     report = replay("mpcoffline/pendulum/ddpg-v0", n_episodes=5)
     assert report.ok

@@ -18,6 +18,7 @@ import pytest
 from crashing import ACTIONS, DATASET, SPACE, check_survivors, episode, recording
 from hypothesis import given
 from hypothesis import strategies as st
+from pendulum_data import recorded, stored
 
 from mpcoffline.core.errors import StorageError
 from mpcoffline.datasets import dataset_from_arrays, repair
@@ -100,12 +101,10 @@ def test_a_replaced_data_set_stays(limit: Any) -> None:
 
 
 def test_a_packed_file_stays(limit: Any, tmp_path: Path) -> None:
-    from mpcoffline.datasets import load_dataset
-
-    dataset = load_dataset("mpcoffline/linear/ddpg-v0")
+    dataset = stored(episodes=recorded(length=1_000))
     path = tmp_path / "packed.h5"
     path.write_bytes(b"before")
-    limit(100_000)
+    limit(10_000)
     with pytest.raises(StorageError):
         pack(dataset, path)
     assert path.read_bytes() == b"before"
