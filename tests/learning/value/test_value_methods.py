@@ -53,6 +53,7 @@ def test_iql_averages_over_luck_where_the_expectile_of_samples_is_optimistic(met
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_the_swing_ups_value_is_that_of_dynamic_programming() -> None:
     table = TransitionTable.from_minari("mpcoffline/pendulum/ddpg-v0").trim(0.9)
     config = ValueConfig(
