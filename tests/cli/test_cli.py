@@ -114,6 +114,7 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
     assert "foreign.zip" in refused("evaluate", foreign, "--env", PENDULUM)
 
 
+@pytest.mark.usefixtures("shipped")
 def test_an_output_that_is_no_folder_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert "file" in refused("run", "pendulum", "--output", tmp_path / "file" / "below")
@@ -161,12 +162,13 @@ def test_evaluate_refuses_what_does_not_belong_together(policy_file: Path) -> No
     assert "--alpha" in refused("evaluate", policy_file, "--env", PENDULUM, "--alpha", "0.5")
 
 
+@pytest.mark.usefixtures("shipped")
 def test_learn_saves_learner_and_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Brief(OfflineMPCLearner):
         def __init__(self, *args: object, **kwargs: object) -> None:
             super().__init__(*args, value_n_steps=10, fit_n_steps=5, refit_rows=500, **kwargs)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("mpcoffline.learner.OfflineMPCLearner", Brief)
+    monkeypatch.setattr("mpcoffline.learner.learner.OfflineMPCLearner", Brief)
     result = call(
         *("learn", "--dataset", "mpcoffline/pendulum/ddpg-v0", "--preset", "paper"),
         *("--learn", "cost", "--value", "td", "--seed", "2"),

@@ -143,6 +143,7 @@ def test_odd_data_give_a_verdict_and_no_nan() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_a_swing_up_is_diagnosed() -> None:
     from mpcoffline.learning import ValueConfig, fit_value
 

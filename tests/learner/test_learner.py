@@ -129,6 +129,7 @@ def test_table_id_and_dataset_give_the_same_bits() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_shipped_data_are_known_by_id() -> None:
     learner = quick(nominal_mpc("mpcoffline/PendulumSwingUp-v0", 0.5, 0), learn="cost")
     learner.fit("mpcoffline/pendulum/ddpg-v0", show_progress=False)

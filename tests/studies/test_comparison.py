@@ -29,6 +29,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_every_controller_has_a_row_in_every_case() -> None:
     group = CaseGroup("pendulum", 0, "clean", ((1.5, 0), (0.5, 1)))
     rows = run_group(group, n_episodes=3)
@@ -46,6 +47,7 @@ def test_every_controller_has_a_row_in_every_case() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_the_linear_task_is_compared_with_its_optimum() -> None:
     rows = {row.controller: row for row in run_group(CaseGroup("linear", 0, "clean", ((1.0, 0),)), n_episodes=3)}
     assert min(rows.values(), key=lambda row: row.discounted_cost).controller == "optimal"

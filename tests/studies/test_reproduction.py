@@ -13,9 +13,7 @@ BRIEF = {"value_n_steps": 20, "fit_n_steps": 5, "refit_rows": 500}
 
 
 @pytest.fixture(autouse=True)
-def brief(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "minari").mkdir()
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+def brief(shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reproduction, "run_task", partial(run_task, **BRIEF))
 
 
