@@ -85,13 +85,16 @@ class Registry(Generic[T]):
             hint=f"If it is one of your own or of another package, import what registers that {self.kind} first.",
         )
 
-    def name_of(self, thing: object) -> str:
-        """What a thing is called here; empty where it is not: a subclass is another thing."""
-        return next((name for name, known in self._things.items() if known is thing), "")
+    def name_of(self, thing: Any, *, shared: bool = False) -> str:
+        """What a thing is called here; empty where it is not: a subclass is another thing.
 
-    def shared_name_of(self, thing: type[Any]) -> str:
-        """As :meth:`name_of`, but of classes of this package alone: what another process knows too."""
-        return self.name_of(thing) if thing.__module__.split(".")[0] == __name__.split(".")[0] else ""
+        Args:
+            thing: The thing.
+            shared: Whether classes of this package alone count, which every process knows.
+        """
+        if shared and thing.__module__.split(".")[0] != __name__.split(".")[0]:
+            return ""
+        return next((name for name, known in self._things.items() if known is thing), "")
 
     def items(self) -> ItemsView[str, T]:
         """Names and things."""

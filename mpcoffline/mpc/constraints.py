@@ -249,7 +249,7 @@ def constraints_to_json(
     found = []
     for constraint in constraints:
         own: Any = constraint
-        name = (CONSTRAINTS.shared_name_of if portable else CONSTRAINTS.name_of)(type(constraint))
+        name = CONSTRAINTS.name_of(type(constraint), shared=portable)
         form = Constraint if isinstance(constraint, Constraint) else StateBounds
         found.append(dict(own.to_json()) | {"kind": name} if name else form.to_json(own))
     return found

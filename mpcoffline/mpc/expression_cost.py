@@ -85,7 +85,7 @@ def cost_to_json(
         InvalidArgumentError: For an expression that is no plain arithmetic.
     """
     own: Any = cost
-    if name := (COSTS.shared_name_of if portable else COSTS.name_of)(type(cost)):
+    if name := COSTS.name_of(type(cost), shared=portable):
         return dict(own.to_json()) | {"kind": name}
     theta = ca.SX.sym("theta", cost.space.size)
     variables = [ca.SX.sym("x", nx), *([] if nu is None else [ca.SX.sym("u", nu)])]

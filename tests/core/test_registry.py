@@ -17,7 +17,7 @@ class Shape(ABC):
 
 @pytest.fixture
 def shapes() -> Registry[type[Shape]]:
-    registry: Registry[type[Shape]] = Registry("shape", Shape, methods=("corners",))
+    registry: Registry[type[Shape]] = Registry("shape", Shape, methods=("corners|radius",))
 
     @registry.register("square")
     class Square(Shape):
@@ -34,6 +34,9 @@ def test_names_give_what_was_registered(shapes: Registry[type[Shape]]) -> None:
     assert shapes["square"]().area() == 1.0
     assert shapes.of_file("square", "a.zip") is shapes["square"]
     assert shapes.add("square", shapes["square"]) is shapes["square"]
+    assert shapes.name_of(shapes["square"]) == "square"
+    assert shapes.name_of(shapes["square"], shared=True) == ""  # of this test
+    assert shapes.name_of(Shape) == ""
 
 
 @pytest.mark.parametrize("name", ["sqare", 3, None, b"square", ["square"]])
@@ -61,7 +64,7 @@ def test_what_is_refused(shapes: Registry[type[Shape]]) -> None:
 
     with pytest.raises(InvalidArgumentError, match="expected a name that is free, got taken"):
         shapes.add("square", Round)
-    with pytest.raises(InvalidArgumentError, match="expected the methods corners"):
+    with pytest.raises(InvalidArgumentError, match=r"expected the methods corners\|radius"):
         shapes.add("round", Cornerless)
     with pytest.raises(InvalidArgumentError, match="expected the methods area"):
         shapes.register("round")(Abstract)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from typing import Any
 
 import casadi as ca
@@ -121,3 +122,10 @@ def test_a_registered_solver_takes_part_in_auto(monkeypatch: pytest.MonkeyPatch)
     assert (longer.name, longer.reason) == ("lqr", "lqr is the fastest that fits; eager does not support long horizons")
     with pytest.raises(InvalidArgumentError, match="mpc: expected a problem that the eager solver takes, got long"):
         make_solver(integrator(horizon=5), "eager")
+
+
+def test_a_pickled_solver_has_the_options_that_it_was_made_with() -> None:
+    solver = make_solver(integrator(horizon=2), "ipopt", max_time=5.0, n_starts=2)
+    again = pickle.loads(pickle.dumps(solver))
+    assert again.options == solver.options
+    assert solvers.changed_options(again) == {"max_time": 5.0, "n_starts": 2}
