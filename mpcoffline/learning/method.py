@@ -16,7 +16,7 @@ from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
-from .stages import Stage
+from .stages import Change, Stage
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class Method(ABC):
         ... class Mine(Method):
         ...     fit: MyConfig = field(default_factory=MyConfig)
         ...
-        ...     def stages(self):
+        ...     def stages(self) -> dict[str, Stage | Change]:
         ...         return {"fit": MyStage(self.fit)}
         >>> OfflineMPCLearner(mpc, method="mine")
 
@@ -61,8 +61,8 @@ class Method(ABC):
             check_integers(1, horizon=self.horizon)
 
     @abstractmethod
-    def stages(self) -> dict[str, Stage]:
-        """New stages by name, in their order."""
+    def stages(self) -> dict[str, Stage | Change]:
+        """The stages by name, in their order."""
 
     @property
     def name(self) -> str:

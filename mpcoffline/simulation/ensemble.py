@@ -9,11 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import Identification, OneStepProblem, Transitions, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
-
-from .features import RandomFeatures, Ridge
 
 Array = NDArray[np.float64]
 
@@ -152,6 +151,6 @@ def _missed(problem: OneStepProblem, z: Array, rng: np.random.Generator) -> _Res
     rows = problem.rows
     missed = -problem.errors(problem.theta(z)) * problem.scale
     inputs = np.hstack([rows.x, rows.u])
-    features = RandomFeatures(inputs, _N_FEATURES, rng, quadratic=False)
+    features = RandomFeatures(inputs, _N_FEATURES, rng, n_multiplied=0)
     regression = Ridge.fit(features(inputs), missed, _RESIDUAL_RIDGE)
     return _Residual(features, regression, np.quantile(np.abs(missed), 0.999, axis=0))

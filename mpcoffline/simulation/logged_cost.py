@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.table.transitions import TransitionTable
-
-from .features import RandomFeatures, Ridge
+from mpcoffline.estimation.features import RandomFeatures, Ridge
 
 Array = NDArray[np.float64]
 

@@ -133,7 +133,7 @@ HOSTILE: dict[str, Callable[[Document], None]] = {
     "tolerance text": put("solver_options", {"tolerance": "x"}),
     "another option": put("solver_options", {"hsllib": "x.so"}),
     "version true": put("version", True),
-    "version 1.0": put("version", 1.0),
+    "version 2.0": put("version", 2.0),
     "noise text": put("exploration_noise", "0.1"),
 }
 
