@@ -11,12 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
-from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.learning.bellman.equation import BellmanProblem, variance_of
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.coordinates import Coordinates
+from mpcoffline.simulation.features import RandomFeatures, Ridge
 
 Array = NDArray[np.float64]
 
@@ -247,10 +246,15 @@ def goal_share(table: TransitionTable, reference: Array) -> float:
 
 
 def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
-    """Learned parameters on a bound that were not on it before; the zeros of a factor's diagonal are no bounds."""
-    before, after = (dict(zip(part.space.names, part.theta, strict=True)) for part in (nominal, mpc))
-    names = Coordinates(mpc, ("cost", "model")).at_bounds(mpc.theta)
-    return tuple(name for name in names if before.get(name) != after[name])
+    """Parameters on a bound that were not on it before; the zeros of a matrix factor's diagonal are no bounds."""
+    names = []
+    factors = {name for block in mpc.space if block.kind == "psd" for name in block.coordinate_names}
+    before = dict(zip(nominal.space.names, nominal.theta, strict=True))
+    for name, value, low, high in zip(mpc.space.names, mpc.theta, mpc.space.low, mpc.space.high, strict=True):
+        near = 1e-6 * (1.0 + abs(value))
+        if name not in factors and (value - low < near or high - value < near) and before.get(name) != value:
+            names.append(name)
+    return tuple(names)
 
 
 def _sample(table: TransitionTable, seed: int, count: int = _ROWS) -> TransitionTable:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .identification import FULL_TURN, Transitions
+from .identification import Rows
 from .kalman import Linearised
 from .one_step import OneStep
 
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _LENGTHS = (200, 100, 50, 25, 12)  # steps that a trajectory may have; longer ones are cut and filtered side by side
 _CUT = 1e-3  # share of the pairs of measurements of one state that may be taken for a gap
+_FULL_TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Trajectories:
         turns = np.zeros((*index.shape, 2, mpc.nx))
         for i in unwrapped:
             turns[:, :, 0, i] = np.unwrap(s[:, :, i], axis=1) - s[:, :, i]
-            turns[:, :, 1, i] = -FULL_TURN * np.round((reached - s - turns[:, :, 0])[:, :, i] / FULL_TURN)
+            turns[:, :, 1, i] = -_FULL_TURN * np.round((reached - s - turns[:, :, 0])[:, :, i] / _FULL_TURN)
         s, reached = s + turns[:, :, 0], reached + turns[:, :, 1]
         model, scale = OneStep(mpc, mpc.space.mask(("model",))), np.where(spread > 0.0, spread, 1.0)
         return cls(model, scale, spread, repeated, index, valid, s, columns.actions[index], reached, turns)
@@ -79,9 +80,9 @@ class Trajectories:
         names = ("index", "valid", "s", "inputs", "reached", "turns")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
-    def rows(self) -> Transitions:
+    def rows(self) -> Rows:
         """The transitions, one after another."""
-        return Transitions(self.s[self.valid], self.inputs[self.valid], self.reached[self.valid])
+        return Rows(self.s[self.valid], self.inputs[self.valid], self.reached[self.valid])
 
     @property
     def counts(self) -> Array:
@@ -138,5 +139,5 @@ def _wrapped(difference: Array, angles: tuple[int, ...]) -> Array:
     """The difference without full turns in the coordinates that are angles."""
     result = difference.copy()
     for i in angles:
-        result[:, i] -= FULL_TURN * np.round(result[:, i] / FULL_TURN)
+        result[:, i] -= _FULL_TURN * np.round(result[:, i] / _FULL_TURN)
     return result

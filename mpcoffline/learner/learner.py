@@ -273,7 +273,7 @@ class OfflineMPCLearner:
             "learn": self.learn,
             "preset": self.preset,
             "method": self.method.name,
-            "options": self.method.options,
+            "options": self.method.to_json(),
             "value_given": self._given_value_function is not None,
             "seed": self.seed,
             "device": self.device,
@@ -296,7 +296,7 @@ class OfflineMPCLearner:
         method = METHODS.of_file(document.get("method"), str(path))
         with file_errors(path):
             nominal = MPC.from_json(document["nominal"])
-            how = method().replaced(document["options"])
+            how = method.from_json(document["options"])
             learner = cls(nominal, document["learn"], seed=document["seed"], method=how, device=document["device"])
             if document["preset"] is not None:
                 learner.preset = check_name("preset", document["preset"], error=FileFormatError)

@@ -118,10 +118,10 @@ class Run:
             "nominal": start.mpc.to_json(),
             "groups": start.groups,
             "method": self.method.name,
-            "options": self.method.options,
+            "options": self.method.to_json(),
             "seed": start.seed,
         }
-        digest = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode())
+        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
         for column in (start.table.rows, start.table.episode_ids, *start.table.centring):
             digest.update(np.ascontiguousarray(column).data)
         if start.value_function is not None:

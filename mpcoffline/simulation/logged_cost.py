@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.features import RandomFeatures, Ridge
+
+from .features import RandomFeatures, Ridge
 
 Array = NDArray[np.float64]
 

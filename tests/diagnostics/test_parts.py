@@ -22,11 +22,11 @@ from mpcoffline.diagnostics.measures import (
     value_check,
 )
 from mpcoffline.diagnostics.stability import closed_loop_eigenvalues, value_growth, weight_checks
-from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import identify
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.simulation.closed_loop import initial_states, simulate
 from mpcoffline.simulation.ensemble import Ensemble
+from mpcoffline.simulation.features import RandomFeatures, Ridge
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.solvers import make_solver
 

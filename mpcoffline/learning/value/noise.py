@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.features import RandomFeatures
 
 Array = NDArray[np.float64]
 
@@ -66,11 +65,22 @@ def estimate_stochasticity(table: TransitionTable, *, seed: int = 0) -> Stochast
     half = len(rows) // 2
     if half < _MIN_ROWS:
         return Stochasticity(0.0, 0.0)
-    features = RandomFeatures(x, _FEATURES, rng, n_multiplied=_MULTIPLIED, slopes=(0.2, 1.0))(x)
-    spread = y.std(axis=0)
-    shares = _unexplained(features, (y - y.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0), half)
+    shares = _unexplained(_features(_standardised(x), rng), _standardised(y), half)
     changes = shares[:-1][np.ptp(y[:, :-1], axis=0) > 0.0]
     return Stochasticity(float(changes.mean()) if len(changes) else 0.0, float(shares[-1]))
+
+
+def _standardised(x: Array) -> Array:
+    std = x.std(axis=0)
+    return np.asarray((x - x.mean(axis=0)) / np.where(std > 0.0, std, 1.0))
+
+
+def _features(x: Array, rng: np.random.Generator) -> Array:
+    """1, x, the products of its coordinates, and random features of it at slopes from flat to steep."""
+    slopes = rng.normal(size=(x.shape[1], _FEATURES)) * rng.uniform(0.2, 1.0, size=_FEATURES)
+    waves = np.tanh(x @ slopes + rng.uniform(-2.0, 2.0, size=_FEATURES))
+    i, j = np.triu_indices(min(x.shape[1], _MULTIPLIED))
+    return np.hstack([np.ones((len(x), 1)), x, x[:, i] * x[:, j], waves])
 
 
 def _unexplained(features: Array, y: Array, half: int) -> Array:

@@ -19,26 +19,15 @@ class RandomFeatures:
         x: Data that decide the scale, ``(n, d)``.
         n_random: Number of random directions.
         rng: Draws them.
-        n_multiplied: How many entries of x, the first ones, products are made of; all by default.
-        slopes: Smallest and largest slope along a random direction.
+        quadratic: Whether products are among the features.
     """
 
-    def __init__(
-        self,
-        x: Array,
-        n_random: int,
-        rng: np.random.Generator,
-        *,
-        n_multiplied: int | None = None,
-        slopes: tuple[float, float] | None = None,
-    ) -> None:
+    def __init__(self, x: Array, n_random: int, rng: np.random.Generator, *, quadratic: bool = True) -> None:
         self._mean, spread = x.mean(axis=0), x.std(axis=0)
         self._spread = np.where(spread > 0.0, spread, 1.0)
         self._directions = rng.standard_normal((x.shape[1], n_random))
-        if slopes is not None:
-            self._directions *= rng.uniform(*slopes, n_random)
         self._offsets = rng.uniform(-2.0, 2.0, n_random)
-        self._pairs = np.triu_indices(x.shape[1] if n_multiplied is None else min(x.shape[1], n_multiplied))
+        self._pairs = np.triu_indices(x.shape[1]) if quadratic else (np.zeros(0, int), np.zeros(0, int))
 
     def __call__(self, x: Array) -> Array:
         """Features of x ``(n, d)``, ``(n, m)``."""
