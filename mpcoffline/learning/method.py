@@ -162,11 +162,10 @@ def _described(option: Any) -> Any:
 
 def _rebuilt(kind: Any, data: Any) -> Any:
     """The inverse of :func:`_described`."""
-    if not is_dataclass(kind):
+    if not isinstance(data, dict):
         return data
-    from_json = getattr(kind, "from_json", None)
-    if from_json is not None:
-        return from_json(data)
+    if hasattr(kind, "from_json"):
+        return kind.from_json(data)
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in data.items()})
 
 

@@ -15,7 +15,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .bellman.potential import Potential
+from .potential import Potential
 from .value.function import ValueFunction
 
 Arrays = dict[str, NDArray[Any]]

@@ -25,7 +25,7 @@ from mpcoffline.core.archive import read_archive
 from mpcoffline.core.documents import parsed_json
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.learning import ValueFunction
-from mpcoffline.learning.bellman.potential import Potential
+from mpcoffline.learning.potential import Potential
 from mpcoffline.mpc import Constraint
 from mpcoffline.mpc.parameters import Block
 

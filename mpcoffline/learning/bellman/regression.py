@@ -38,7 +38,7 @@ class ParameterConfig:
             cost's variance.
         prediction_weight: Weight of the one-step prediction error
             (:class:`~mpcoffline.learning.bellman.PredictionError`) beside (FIT); 0 is the published method.
-        potential: Whether the cost is fitted with a :class:`~mpcoffline.learning.bellman.potential.Potential` besides.
+        potential: Whether the cost is fitted with a :class:`~mpcoffline.learning.potential.Potential` besides.
         n_steps: Gradient steps on cost and model together; none where the model is not learned.
         batch_size: Transitions a step.
         learning_rate: Adam's at the start, in scaled coordinates; falls to zero on a cosine.
