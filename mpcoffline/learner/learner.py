@@ -61,7 +61,7 @@ class OfflineMPCLearner:
         learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3).
         preset: Name of a learning method with options in ``mpcoffline.learner.PRESETS``: ``"paper"`` is the published
             recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
-            longest. ``"default"`` where no method is given.
+            longest.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
@@ -86,7 +86,7 @@ class OfflineMPCLearner:
         self,
         mpc: MPC,
         learn: Learn = "cost+model",
-        preset: str | None = None,
+        preset: str = "default",
         seed: int = 0,
         *,
         method: str | Method | None = None,
@@ -97,13 +97,12 @@ class OfflineMPCLearner:
     ) -> None:
         if not isinstance(learn, str) or learn not in _GROUPS:
             raise InvalidArgumentError("learn", expected="'cost' or 'cost+model'", actual=repr(learn))
-        if method is not None and preset is not None:
-            raise InvalidArgumentError(
-                "preset", expected="none beside a method: a preset names its own", actual=f"{preset!r}"
-            )
+        check_known("preset", preset, PRESETS)
+        if method is not None and preset != "default":
+            expected = "none beside a method: a preset names its own"
+            raise InvalidArgumentError("preset", expected=expected, actual=repr(preset))
+        self.preset = preset if method is None else None
         if method is None:
-            preset = "default" if preset is None else preset
-            check_known("preset", preset, PRESETS)
             method = PRESETS[preset]
         elif not isinstance(method, Method):
             method = METHODS[method]()
@@ -115,7 +114,7 @@ class OfflineMPCLearner:
                 "value_function", expected=f"a function of {mpc.nx} coordinates", actual=str(value_function.ny)
             )
         self.method = method.replaced(options)
-        self.nominal_mpc, self.learn, self.preset, self.seed, self.device = mpc, learn, preset, int(seed), device
+        self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
         self.history: History = []
@@ -305,7 +304,7 @@ class OfflineMPCLearner:
         method = METHODS.of_file(document.get("method"), str(path))
         with file_errors(path):
             nominal = MPC.from_json(document["nominal"])
-            how = method().replaced(document["options"])
+            how = method.from_json(document["options"])
             learner = cls(nominal, document["learn"], seed=document["seed"], method=how, device=document["device"])
             if document["preset"] is not None:
                 learner.preset = check_name("preset", document["preset"], error=FileFormatError)

@@ -15,10 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.learning import FitResult, Known, Method, ValueFunction
+from mpcoffline.learning import Change, FitResult, Known, Method, Stage, Training, ValueFunction
+from mpcoffline.learning.stages import Arrays
 from mpcoffline.mpc import MPC
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class Epoch(NamedTuple):
@@ -59,13 +58,13 @@ class Run:
         mpc = start.mpc
         start.table.check_fits(mpc.nx, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
         _check_device(start.device)
-        self.method, self._start, self._stages = method, start, method.stages()
+        self.method, self._start = method, start
         self._mpc = method.restructured(mpc)
         _check_discount(start.value_function, self._mpc.discount)
         self._outcome: Callable[[], Known] | None = None
         self.value_function = start.value_function
         self.result: FitResult | None = None
-        self._begun: list[str] = []
+        self._trainings: dict[str, Training] = {}
         self._restored: dict[str, Arrays] = {}
 
     def epochs(self, n_steps: int | None = None) -> Iterator[Epoch]:
@@ -79,33 +78,31 @@ class Run:
             MPCOfflineError: If a regression fails.
         """
         known = replace(self._start, mpc=self._mpc, table=self._start.table.trim(self.method.trim))
-        stages, total = list(self._stages.items()), 0
-        last = max((i for i, (_, stage) in enumerate(stages) if not stage.quick), default=len(stages) - 1)
-        for i, (name, stage) in enumerate(stages[: last + 1]):
-            stage.begin(known)
-            self._begun.append(name)
+        stages, total = list(self.method.stages().items()), 0
+        while stages:
+            (name, stage), *stages = stages
+            if not isinstance(stage, Stage):
+                known = stage(known)
+                continue
+            training = stage.begin(known)
+            if training is None:
+                continue
+            self._trainings[name] = training
             if name in self._restored:
-                stage.restore(self._restored.pop(name))
-            while not stage.done or (i == last and self._outcome is None):
-                metrics = stage.advance(n_steps or stage.epoch)
-                if i == last:
-                    self._outcome = functools.cache(lambda i=i: self._ended(i))  # holds until the next step
-                    self.result = self._outcome().result if stage.done else None
-                yield Epoch(stage.phase, stage.step, stage.n_steps, total + stage.step, metrics)
-            if i < last:
-                known, total = stage.outcome(), total + stage.step
-                self.value_function = known.value_function
-
-    def _ended(self, i: int) -> Known:
-        """What is known if stage i ends now: the stages after it take no steps."""
-        first, *others = list(self._stages.values())[i:]
-        known = first.outcome()
-        for stage in others:
-            stage.begin(known)
-            known = stage.outcome()
-        if known.result is None:
-            raise InvalidArgumentError("stages", expected="one that leaves a result", actual="none")
-        return known
+                training.restore(self._restored.pop(name))
+            changes = [later for _, later in stages if not isinstance(later, Stage)]
+            while not training.done:
+                metrics = training.advance(n_steps or stage.epoch)
+                if len(changes) == len(stages):  # the last stage with steps; what is found once holds until the next
+                    self._outcome = functools.cache(functools.partial(_ended, known, stage, training, changes))
+                    self.result = self._outcome().result if training.done else None
+                yield Epoch(stage.phase, training.step, training.n_steps, total + training.step, metrics)
+            if self._outcome is not None:
+                return
+            known, total = stage.outcome(known, training), total + training.step
+            self.value_function = known.value_function
+        self._outcome, self.result = lambda: _complete(known), _complete(known).result
+        yield Epoch("learning", 1, 1, total + 1, {})
 
     @property
     def learned(self) -> Callable[[], MPC] | None:
@@ -121,10 +118,10 @@ class Run:
             "nominal": start.mpc.to_json(),
             "groups": start.groups,
             "method": self.method.name,
-            "options": self.method.options,
+            "options": self.method.to_json(),
             "seed": start.seed,
         }
-        digest = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode())
+        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
         for column in (start.table.rows, start.table.episode_ids, *start.table.centring):
             digest.update(np.ascontiguousarray(column).data)
         if start.value_function is not None:
@@ -134,14 +131,31 @@ class Run:
 
     def to_arrays(self) -> Arrays:
         """What :meth:`restore` needs, between two epochs."""
-        return {f"{name}/{key}": array for name in self._begun for key, array in self._stages[name].to_arrays().items()}
+        return {
+            f"{name}/{key}": array
+            for name, training in self._trainings.items()
+            for key, array in training.to_arrays().items()
+        }
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Makes :meth:`epochs` go on from a state of :meth:`to_arrays` of a run with the same arguments."""
-        for name in self._stages:
-            own = {key.removeprefix(f"{name}/"): a for key, a in arrays.items() if key.startswith(f"{name}/")}
-            if own:
-                self._restored[name] = own
+        for key, array in arrays.items():
+            name, _, own = key.partition("/")
+            self._restored.setdefault(name, {})[own] = array
+
+
+def _ended(known: Known, stage: Stage, training: Training, changes: list[Change]) -> Known:
+    """What is known if the last stage with steps ends now."""
+    known = stage.outcome(known, training)
+    for change in changes:
+        known = change(known)
+    return _complete(known)
+
+
+def _complete(known: Known) -> Known:
+    if known.result is None:
+        raise InvalidArgumentError("stages", expected="one that leaves a result", actual="none")
+    return known
 
 
 def _check_discount(value_function: ValueFunction | None, discount: float) -> None:

@@ -6,8 +6,8 @@ import logging
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Self
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
-from .stages import Stage
-from .value.methods import ValueMethod, method_to_json
+from .stages import Change, Stage
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ class Method(ABC):
         ... class Mine(Method):
         ...     fit: MyConfig = field(default_factory=MyConfig)
         ...
-        ...     def stages(self):
+        ...     def stages(self) -> dict[str, Stage | Change]:
         ...         return {"fit": MyStage(self.fit)}
         >>> OfflineMPCLearner(mpc, method="mine")
 
@@ -62,8 +61,8 @@ class Method(ABC):
             check_integers(1, horizon=self.horizon)
 
     @abstractmethod
-    def stages(self) -> dict[str, Stage]:
-        """New stages by name, in their order."""
+    def stages(self) -> dict[str, Stage | Change]:
+        """The stages by name, in their order."""
 
     @property
     def name(self) -> str:
@@ -86,17 +85,6 @@ class Method(ABC):
             for name, (stage, field) in self._homes().items()
         }
 
-    def to_json(self) -> dict[str, Any]:
-        """The options as a file has them, for :meth:`replaced`.
-
-        Raises:
-            InvalidArgumentError: For a value method of one's own that no file can hold.
-        """
-        return {
-            name: method_to_json(value) if isinstance(value, ValueMethod) else value
-            for name, value in self.options.items()
-        }
-
     def replaced(self, options: Mapping[str, Any]) -> Self:
         """The method with options replaced by name, of which each has one.
 
@@ -116,10 +104,23 @@ class Method(ABC):
             if given not in homes:
                 raise UnknownIdError.of(f"option of the learning method {type(self).__name__}", given, homes)
             stage, field = homes[given]
-            plain = value.item() if isinstance(value, np.generic) else value  # JSON has neither numpy nor tuples
-            changes[stage][field] = tuple(plain) if isinstance(plain, list) else plain
+            changes[stage][field] = value.item() if isinstance(value, np.generic) else value  # JSON has no numpy
         own = changes.pop("", {})
         return replace(self, **own, **{stage: replace(getattr(self, stage), **part) for stage, part in changes.items()})
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description, by stage; its options may have a ``to_json`` and ``from_json`` of their own."""
+        return {field.name: _described(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """The inverse of :meth:`to_json`; raises what the options raise.
+
+        Raises:
+            TypeError: For options of other names.
+        """
+        kinds = {field.name: type(getattr(cls(), field.name)) for field in fields(cls)}
+        return cls(**{name: _rebuilt(kinds.get(name), value) for name, value in data.items()})
 
     def _homes(self) -> dict[str, tuple[str, str]]:
         """Stage (``""`` for none) and field of each option."""
@@ -149,6 +150,23 @@ class Method(ABC):
         if self.cross_term:
             _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")
         return mpc
+
+
+def _described(option: Any) -> Any:
+    """An option, or the options of a stage, as JSON."""
+    if not is_dataclass(option):
+        return option
+    to_json = getattr(option, "to_json", None)
+    return asdict(cast("Any", option)) if to_json is None else to_json()
+
+
+def _rebuilt(kind: Any, data: Any) -> Any:
+    """The inverse of :func:`_described`."""
+    if not isinstance(data, dict):
+        return data
+    if hasattr(kind, "from_json"):
+        return kind.from_json(data)
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in data.items()})
 
 
 #: Add a method of your own by ``@METHODS.register("name")`` before its class; files name it.

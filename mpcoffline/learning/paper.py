@@ -9,7 +9,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from .bellman.regression import ParameterConfig
 from .bellman.stages import LearnParameters, LearnValue
 from .method import METHODS, Method
-from .stages import Stage
+from .stages import Change, Stage
 from .value.config import ValueConfig
 
 
@@ -33,6 +33,6 @@ class Paper(Method):
             expected = "a terminal cost from V, as T = V - Phi"
             raise InvalidArgumentError("potential", expected=expected, actual="the given one", hint=hint)
 
-    def stages(self) -> dict[str, Stage]:
+    def stages(self) -> dict[str, Stage | Change]:
         """(VALUE) and (FIT)."""
         return {"value": LearnValue(self.value), "fit": LearnParameters(self.fit)}

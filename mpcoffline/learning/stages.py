@@ -1,25 +1,25 @@
-"""The parts of a learning method: stages, one after another, which can stop between any two steps, and go on."""
+"""The parts of a learning method: what is known, and the stages that add to it, one after another."""
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .bellman.potential import Potential
-from .progress import Metrics
+from .potential import Potential
 from .value.function import ValueFunction
 
 Arrays = dict[str, NDArray[Any]]
+Metrics = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -95,54 +95,59 @@ class Known:
         return copy.deepcopy(self.value_function).cpu().eval().requires_grad_(False)
 
 
-class Stage(ABC):
-    """A stretch of a fit: takes what is known, and adds to it.
-
-    A fit calls ``begin``, perhaps ``restore``, then ``advance`` until it is ``done``, then ``outcome``. ``begin`` may
-    be called again, for a new start.
+class Training(Protocol):
+    """Something learned in steps, which can stop between any two of them, be saved, and go on.
 
     Attributes:
-        phase: What it does, for people.
-        quick: Whether it takes no steps: then only ``begin`` and ``outcome`` are called, also, where no later stage
-            takes any, at the end of an epoch of the one before, to find the MPC that would be handed out now.
-        epoch: Steps between two entries of the history.
-        step: Steps made; it may fall where a stage starts again.
+        step: Steps made; it may fall where a training starts again.
         n_steps: Steps in all.
-        known: What it began with.
     """
 
-    phase: str = ""
-    quick: bool = False
-    epoch: int = 100
-    step: int = 0
-    n_steps: int = 0
-    known: Known
-
-    def begin(self, known: Known) -> None:
-        """Starts anew from what is known."""
-        self.known = known
+    step: int
+    n_steps: int
 
     @property
     def done(self) -> bool:
         """Whether no step is left to make."""
-        return self.step >= self.n_steps
+
+    @property
+    def result(self) -> Any:
+        """What is learned, if it ends now."""
 
     def advance(self, n: int) -> Metrics:
         """Makes n more steps, fewer at the end; returns means over them, by name."""
-        return {}
-
-    @abstractmethod
-    def outcome(self) -> Known:
-        """What is known if the stage ends now."""
 
     def to_arrays(self) -> Arrays:
         """What :meth:`restore` needs to go on bit for bit."""
-        return {}
 
     def restore(self, arrays: Arrays) -> None:
-        """Goes on from a state of :meth:`to_arrays` of a stage that began with the same.
+        """Goes on from a state of :meth:`to_arrays` of a training with the same arguments.
 
         Raises:
             FileFormatError: If arrays are missing or of another problem.
         """
-        raise FileFormatError("state of a stage", expected="none", actual=", ".join(arrays)[:200])
+
+
+class Stage(ABC):
+    """A stretch of a fit that takes steps: a training that begins with what is known, and what becomes of its result.
+
+    Attributes:
+        phase: What it does, for people.
+        epoch: Steps between two entries of the history.
+    """
+
+    phase: str = ""
+    epoch: int = 100
+
+    @abstractmethod
+    def begin(self, known: Known) -> Training | None:
+        """The training; None where nothing is left to learn."""
+
+    @abstractmethod
+    def outcome(self, known: Known, training: Training) -> Known:
+        """What is known if the training ends now; ``known`` is what it began with."""
+
+
+#: A stretch of a fit without steps: from what is known to what is known then. Where no later stage takes steps, it is
+#: also taken at the end of an epoch, to find the MPC that would be handed out if the fit ended there.
+Change = Callable[[Known], Known]

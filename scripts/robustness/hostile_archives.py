@@ -257,8 +257,8 @@ VALUES: dict[str, tuple[str, Any]] = {
     "solver options a list": ("solver_options", [1]),
     "an unknown solver": ("solver", "os:system"),
     "version true": ("version", True),
-    "version 1.0": ("version", 1.0),
-    "version a list": ("version", [1]),
+    "version 2.0": ("version", 2.0),
+    "version a list": ("version", [2]),
     "noise a text": ("exploration_noise", "0.1"),
     "noise NaN": ("exploration_noise", float("nan")),
 }

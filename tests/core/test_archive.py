@@ -183,6 +183,7 @@ def foreign_files(tmp_path: Path) -> dict[str, Path]:
         "format": zipped("format", changed(format="other")),
         "kind": zipped("kind", changed(kind="policy")),
         "version": zipped("version", changed(version=99)),
+        "older version": zipped("older", changed(version=1)),
         "no version": zipped("noversion", json.dumps({"format": "mpcoffline", "kind": "thing"})),
     }
 
@@ -201,8 +202,10 @@ def test_messages_say_what_was_found(tmp_path: Path) -> None:
     files = foreign_files(tmp_path)
     with pytest.raises(FileFormatError, match=r"expected an mpcoffline thing file, got .*'policy'"):
         read_archive(files["kind"], "thing")
-    with pytest.raises(FileFormatError, match=r"file version 1, got 99. Use the version of mpcoffline that wrote it"):
-        read_archive(files["version"], "thing")
+    for name, version in (("version", 99), ("older version", 1)):
+        message = f"file version 2, got {version}. Use the version of mpcoffline that wrote it"
+        with pytest.raises(FileFormatError, match=message):
+            read_archive(files[name], "thing")
 
 
 # ---------------------------------------------------------------- fuzzing

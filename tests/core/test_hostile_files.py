@@ -25,7 +25,7 @@ from mpcoffline.core.archive import read_archive
 from mpcoffline.core.documents import parsed_json
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.learning import ValueFunction
-from mpcoffline.learning.bellman.potential import Potential
+from mpcoffline.learning.potential import Potential
 from mpcoffline.mpc import Constraint
 from mpcoffline.mpc.parameters import Block
 
@@ -133,7 +133,7 @@ HOSTILE: dict[str, Callable[[Document], None]] = {
     "tolerance text": put("solver_options", {"tolerance": "x"}),
     "another option": put("solver_options", {"hsllib": "x.so"}),
     "version true": put("version", True),
-    "version 1.0": put("version", 1.0),
+    "version 2.0": put("version", 2.0),
     "noise text": put("exploration_noise", "0.1"),
 }
 

@@ -13,7 +13,7 @@ import pytest
 from mpcoffline import OfflineMPCLearner
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
-from mpcoffline.learning import METHODS, FitResult, Known, Method, Stage
+from mpcoffline.learning import METHODS, Change, FitResult, Known, Method, Stage, Training
 
 
 # ---------------------------------------------------------------- what an author writes
@@ -26,36 +26,35 @@ class SearchConfig:
         check_integers(1, n_steps=self.n_steps)
 
 
-class Search(Stage):
+class Search:
     """Random search for the model with the smallest one-step error: another family, of which no room here knows."""
 
-    phase = "searching"
-
-    def __init__(self, config: SearchConfig) -> None:
-        self._config, self.n_steps = config, config.n_steps
-
-    def begin(self, known: Known) -> None:
-        super().begin(known)
-        self.step, self._theta = 0, known.mpc.theta
+    def __init__(self, known: Known, config: SearchConfig) -> None:
+        self._known, self._config, self.step, self.n_steps = known, config, 0, config.n_steps
+        self._theta = known.mpc.theta
         self._first = self._best = self._error(self._theta)
 
     def _error(self, theta: np.ndarray[Any, Any]) -> float:
-        s, a, _, reached, _ = self.known.table.values()
-        return float(np.mean((self.known.mpc.dynamics_function(s.T, a.T, theta).full().T - reached) ** 2))
+        s, a, _, reached, _ = self._known.table.values()
+        return float(np.mean((self._known.mpc.dynamics_function(s.T, a.T, theta).full().T - reached) ** 2))
+
+    @property
+    def done(self) -> bool:
+        return self.step >= self.n_steps
+
+    @property
+    def result(self) -> FitResult:
+        return FitResult(self._theta, self._first, self._best)
 
     def advance(self, n: int) -> dict[str, float]:
-        space = self.known.mpc.space
+        space = self._known.mpc.space
         for _ in range(min(n, self.n_steps - self.step)):
             self.step += 1
-            rng = np.random.default_rng([self.known.seed, self.step])
+            rng = np.random.default_rng([self._known.seed, self.step])
             moved = self._theta + self._config.width * rng.normal(size=space.size) * space.mask(("model",))
             if (error := self._error(moved)) < self._best:
                 self._best, self._theta = error, moved
         return {"prediction_loss": self._best}
-
-    def outcome(self) -> Known:
-        mpc = self.known.mpc.with_theta(self._theta)
-        return replace(self.known, mpc=mpc, result=FitResult(mpc.theta, self._first, self._best))
 
     def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
         return {"theta": self._theta, "step": np.array(self.step), "best": np.array(self._best)}
@@ -64,12 +63,25 @@ class Search(Stage):
         self._theta, self.step, self._best = arrays["theta"], int(arrays["step"]), float(arrays["best"])
 
 
+class SearchStage(Stage):
+    phase = "searching"
+
+    def __init__(self, config: SearchConfig) -> None:
+        self._config = config
+
+    def begin(self, known: Known) -> Training:
+        return Search(known, self._config)
+
+    def outcome(self, known: Known, training: Training) -> Known:
+        return replace(known, mpc=known.mpc.with_theta(training.result.theta), result=training.result)
+
+
 @dataclass(frozen=True)
 class RandomSearch(Method):
     search: SearchConfig = field(default_factory=SearchConfig)
 
-    def stages(self) -> dict[str, Stage]:
-        return {"search": Search(self.search)}
+    def stages(self) -> dict[str, Stage | Change]:
+        return {"search": SearchStage(self.search)}
 
 
 # ---------------------------------------------------------------- what it gets
@@ -150,27 +162,20 @@ def test_the_paper_is_a_method_and_the_default_one_without_its_additions() -> No
 
 
 def test_a_method_without_steps_or_result() -> None:
-    class At(Stage):
-        quick = True
-
-        def outcome(self) -> Known:
-            return replace(self.known, result=FitResult(self.known.mpc.theta, 1.0, 1.0))
-
-    class Nothing(At):
-        def outcome(self) -> Known:
-            return self.known
-
     @dataclass(frozen=True)
     class Quick(Method):
-        stage: type[Stage] = At
+        loss: float | None = 1.0
 
-        def stages(self) -> dict[str, Stage]:
-            return {"at": self.stage()}
+        def stages(self) -> dict[str, Stage | Change]:
+            return {"at": self.found}
+
+        def found(self, known: Known) -> Known:
+            return known if self.loss is None else replace(known, result=FitResult(known.mpc.theta, 1.0, self.loss))
 
     one = OfflineMPCLearner(lq_plant.make_mpc(), method=Quick())
     assert one.fit(lq_plant.random_log(100), show_progress=False) == [(1, {})]
     np.testing.assert_array_equal(one.theta, lq_plant.make_mpc().theta)
     with pytest.raises(InvalidArgumentError, match="stages: expected one that leaves a result"):
-        OfflineMPCLearner(lq_plant.make_mpc(), method=Quick(stage=Nothing)).fit(
+        OfflineMPCLearner(lq_plant.make_mpc(), method=Quick(loss=None)).fit(
             lq_plant.random_log(100), show_progress=False
         )

@@ -78,7 +78,7 @@ def test_a_cross_term_leaves_the_cost_as_it_is_until_it_is_fitted() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_configurations_survive_json(name: str) -> None:
     method = PRESETS[name].replaced({"hidden": (8, 9), "horizon": 3})
-    assert METHODS[method.name]().replaced(json.loads(json.dumps(method.options))) == method
+    assert METHODS[method.name].from_json(json.loads(json.dumps(method.to_json()))) == method
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.datasets.table.transitions import Columns
-from mpcoffline.estimation.identification import FULL_TURN, Transitions, without_jumps
+from mpcoffline.estimation.identification import FULL_TURN, Rows, without_jumps
 from mpcoffline.learning.value.fit import ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
@@ -99,7 +99,7 @@ class PredictionError:
         s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
         with torch.no_grad():
             missed = reached - problem.predicted(sample, theta)
-        rows, self._angles = without_jumps(Transitions(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
+        rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
         spread = (torch.from_numpy(rows.reached) - s).std(dim=0, correction=0)
         self._scale = torch.where(spread > 0.0, spread, 1.0)
 

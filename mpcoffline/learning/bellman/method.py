@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.learning.method import METHODS, Method
-from mpcoffline.learning.stages import Stage
+from mpcoffline.learning.stages import Change, Stage
 from mpcoffline.learning.value.config import ValueConfig
 
 from .regression import ParameterConfig
-from .stages import FitTerminal, Identify, LearnParameters, LearnValue, StartConfig, TerminalConfig
+from .stages import LearnParameters, LearnValue, StartConfig, TerminalConfig, identified, with_terminal_cost
 
 
 @METHODS.register("bellman")
@@ -43,11 +44,11 @@ class Bellman(Method):
                 hint="Set terminal='network' or 'quadratic'.",
             )
 
-    def stages(self) -> dict[str, Stage]:
+    def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""
         return {
-            "identify": Identify(self.identify),
+            "identify": partial(identified, config=self.identify),
             "value": LearnValue(self.value),
             "fit": LearnParameters(self.fit, self.identify.adapt_above),
-            "terminal": FitTerminal(self.terminal),
+            "terminal": partial(with_terminal_cost, config=self.terminal),
         }

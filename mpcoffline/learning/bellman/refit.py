@@ -13,11 +13,11 @@ from torch import Tensor
 
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.datasets.table.transitions import Columns
+from mpcoffline.learning.potential import Potential
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 
 from .equation import BellmanProblem
-from .potential import Potential
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.progress import Metrics, OnEpoch, silent
-from mpcoffline.learning.stages import FitResult
+from mpcoffline.learning.stages import FitResult, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
 from mpcoffline.mpc import MPC
@@ -39,7 +38,7 @@ class ParameterConfig:
             cost's variance.
         prediction_weight: Weight of the one-step prediction error
             (:class:`~mpcoffline.learning.bellman.PredictionError`) beside (FIT); 0 is the published method.
-        potential: Whether the cost is fitted with a :class:`~mpcoffline.learning.bellman.potential.Potential` besides.
+        potential: Whether the cost is fitted with a :class:`~mpcoffline.learning.potential.Potential` besides.
         n_steps: Gradient steps on cost and model together; none where the model is not learned.
         batch_size: Transitions a step.
         learning_rate: Adam's at the start, in scaled coordinates; falls to zero on a cosine.
@@ -73,7 +72,7 @@ class ParameterConfig:
 class ParameterTraining:
     """The state of (FIT) between its steps: Adam on cost and model together, then the convex fit of the cost.
 
-    The second part, :meth:`finish`, minimises the same objective over the cost alone, where it is a linear
+    The second part, which is the last step, minimises the same objective over the cost alone, where it is a linear
     least-squares problem in the weights; it takes the minimum that stochastic gradients only approach. Where the model
     is not learned, it is all.
 
@@ -119,7 +118,8 @@ class ParameterTraining:
             )
         self._low, self._high = (torch.from_numpy(b) for b in (self._coordinates.low, self._coordinates.high))
         self._batches = table.batches(config.batch_size, self._rng)
-        self.n_steps = config.n_steps if "model" in groups else 0
+        self._n_gradients = config.n_steps if "model" in groups else 0
+        self.n_steps = self._n_gradients + 1
         self.attempt = self.step = 0
         self._begin()
 
@@ -130,6 +130,7 @@ class ParameterTraining:
             start = start + 0.1 * np.random.default_rng([self._seed, self.attempt]).normal(size=start.shape)
         z = torch.from_numpy(start)
         self._z = torch.minimum(torch.maximum(z, self._low), self._high).requires_grad_()
+        self._result: FitResult | None = None
         self._optimiser = torch.optim.Adam([self._z], lr=self.config.learning_rate)
 
     @property
@@ -139,19 +140,22 @@ class ParameterTraining:
 
     @property
     def done(self) -> bool:
-        """Whether all gradient steps are made."""
+        """Whether all steps are made."""
         return self.step >= self.n_steps
 
     def advance(self, n: int) -> Metrics:
-        """Makes n more gradient steps, fewer at the end of an attempt; returns their mean regression error."""
+        """Makes n more gradient steps, fewer at the end of an attempt, and alone the last step; returns the error."""
+        if self.step >= self._n_gradients:
+            self.step = min(self.step + n, self.n_steps)
+            return {"fit_loss": self.result.loss_after}
         losses: list[float] = []
-        made = min(n, self.n_steps - self.step)
+        made, self._result = min(n, self._n_gradients - self.step), None
         for _ in range(made):
             self.step += 1
             losses += self._gradient_step()
         if made and not losses:
             _log.warning("(FIT) did not move in %d steps: no gradient was finite; has the model a sqrt at zero?", made)
-        if self.done and self._failed() and self.attempt < self.config.n_restarts:
+        if self.step >= self._n_gradients and self._failed() and self.attempt < self.config.n_restarts:
             self.attempt, self.step = self.attempt + 1, 0
             _log.warning(
                 "(FIT) ended worse than it began; starting again beside theta_0 (%d of at most %d restarts)",
@@ -164,7 +168,7 @@ class ParameterTraining:
     def _gradient_step(self) -> list[float]:
         """One step of Adam, projected onto the bounds; returns the regression error where it was finite."""
         config = self.config
-        schedule = cosine(self.step, self.n_steps) * 0.5**self.attempt
+        schedule = cosine(self.step, self._n_gradients) * 0.5**self.attempt
         self._optimiser.param_groups[0]["lr"] = config.learning_rate * schedule
         batch, theta = self._table.columns(next(self._batches)), self._coordinates.theta(self._z)
         error = self._problem.error(batch, theta)
@@ -194,12 +198,18 @@ class ParameterTraining:
         error = self._problem.error(self._sample, theta)
         return float(error + self.config.prediction_weight * self._prediction_error(self._sample, theta))
 
-    def finish(self) -> FitResult:
-        """The convex fit of the cost from where the gradient steps ended; theta_0's model where they all failed."""
+    @property
+    def result(self) -> FitResult:
+        """The convex fit of the cost from where the gradient steps are; theta_0's model where they all failed."""
+        if self._result is None:
+            self._result = self._finished()
+        return self._result
+
+    def _finished(self) -> FitResult:
         theta = self._mpc.theta
-        if self.n_steps and not self._failed():
+        if self._n_gradients and not self._failed():
             theta = self.theta
-        elif self.n_steps:
+        elif self._n_gradients:
             _log.warning("(FIT) of cost and model failed in every attempt; the model stays as it was")
         config = self.config
         refit = refit_cost(
@@ -240,7 +250,7 @@ class ParameterTraining:
                 "state of (FIT)", expected="that of the same MPC and configuration", actual=str(error)
             ) from error
         self.attempt, self.step = attempt, step
-        for _ in range(attempt * self.n_steps + step):
+        for _ in range(attempt * self._n_gradients + min(step, self._n_gradients)):
             next(self._batches)
         self._begin()
         with torch.no_grad():
@@ -257,8 +267,6 @@ def fit_parameters(
     config: ParameterConfig,
     *,
     seed: int,
-    epoch: int = 100,
-    report: OnEpoch = silent,
 ) -> FitResult:
     """Learns theta by (FIT): a :class:`ParameterTraining` from beginning to end.
 
@@ -269,8 +277,6 @@ def fit_parameters(
         groups: ``("cost",)`` for MPC_2, ``("cost", "model")`` for MPC_3.
         config: Prior and schedules.
         seed: Seeds the minibatches.
-        epoch: Steps between reports.
-        report: Called with ``{"fit_loss": ...}``.
 
     Returns:
         The parameters and the errors before and after.
@@ -279,10 +285,6 @@ def fit_parameters(
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
     """
     training = ParameterTraining(mpc, value, table, groups, config, seed=seed)
-    total = training.n_steps + 1
     while not training.done:
-        metrics = training.advance(epoch)
-        report(training.step, total, metrics)
-    result = training.finish()
-    report(total, total, {"fit_loss": result.loss_after})
-    return result
+        training.advance(training.n_steps)
+    return training.result

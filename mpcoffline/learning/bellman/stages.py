@@ -9,11 +9,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from mpcoffline.core.checks import check_known, check_number
-from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.smoothing import identify_smoothed
-from mpcoffline.learning.progress import Metrics
-from mpcoffline.learning.stages import Arrays, FitResult, Known, Stage
+from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.learning.value.training import ValueTraining
@@ -51,28 +49,15 @@ class StartConfig:
         check_number("adapt_above", self.adapt_above, 0.0, open_low=False)
 
 
-class Identify(Stage):
-    """The table without measurement noise; the model, where it is learned, by its prediction error.
-
-    Args:
-        config: Whether it is done.
-    """
-
-    quick = True
-
-    def __init__(self, config: StartConfig) -> None:
-        self._config = config
-
-    def outcome(self) -> Known:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        known = self.known
-        if self._config.init == "nominal":
-            return known
-        found = identify_smoothed(known.mpc, known.table, seed=known.seed)
-        if "model" not in known.groups:
-            return replace(known, table=found.table)
-        mpc = known.mpc.with_theta(found.identification.theta)
-        return replace(known, mpc=mpc, table=found.table, model_error=found.identification.error_after)
+def identified(known: Known, config: StartConfig) -> Known:
+    """The table without measurement noise, and the model, where it is learned, by its prediction error."""
+    if config.init == "nominal":
+        return known
+    found = identify_smoothed(known.mpc, known.table, seed=known.seed)
+    if "model" not in known.groups:
+        return replace(known, table=found.table)
+    mpc = known.mpc.with_theta(found.identification.theta)
+    return replace(known, mpc=mpc, table=found.table, model_error=found.identification.error_after)
 
 
 class LearnValue(Stage):
@@ -87,47 +72,19 @@ class LearnValue(Stage):
     def __init__(self, config: ValueConfig) -> None:
         self._config = config
 
-    def begin(self, known: Known) -> None:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        super().begin(known)
-        self._training: ValueTraining | None = None
-        self.step = self.n_steps = 0
-        if known.value_function is None:
-            self._training = ValueTraining(
-                known.table, known.mpc.discount, self._config, seed=known.seed, device=known.device
-            )
-            self.n_steps = self._training.n_steps
-
-    @property
-    def done(self) -> bool:
-        """Whether V is given, or all steps are made, or the validation loss has stopped falling."""
-        return self._training is None or self._training.done
-
-    def advance(self, n: int) -> Metrics:
+    def begin(self, known: Known) -> Training | None:
         """See :class:`~mpcoffline.learning.value.training.ValueTraining`."""
-        if self._training is None:
-            return {}
-        metrics = self._training.advance(n)
-        self.step = self._training.step
-        return metrics
+        if known.value_function is not None:
+            return None
+        return ValueTraining(known.table, known.mpc.discount, self._config, seed=known.seed, device=known.device)
 
-    def outcome(self) -> Known:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        return self.known if self._training is None else replace(self.known, value_function=self._training.result.cpu())
-
-    def to_arrays(self) -> Arrays:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        return {} if self._training is None else self._training.to_arrays()
-
-    def restore(self, arrays: Arrays) -> None:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        if self._training is not None:
-            self._training.restore(arrays)
-            self.step = self._training.step
+    def outcome(self, known: Known, training: Training) -> Known:
+        """Adds V_phi."""
+        return replace(known, value_function=training.result.cpu())
 
 
 class LearnParameters(Stage):
-    """Theta by (FIT): steps on cost and model together, and as the last one the convex fit of the cost.
+    """Theta by (FIT).
 
     Args:
         config: How.
@@ -137,19 +94,15 @@ class LearnParameters(Stage):
     def __init__(self, config: ParameterConfig, adapt_above: float = 0.0) -> None:
         self._config, self._adapt_above = config, adapt_above
 
-    def begin(self, known: Known) -> None:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        super().begin(replace(known, mpc=in_units_of(known.mpc, known.table)))
+    def begin(self, known: Known) -> Training:
+        """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
-        self._training = ParameterTraining(
-            self.known.mpc, known.constant_value, known.table, known.groups, self._adapting(), seed=known.seed
-        )
-        self._found: FitResult | None = None
-        self.step, self.n_steps = 0, self._training.n_steps + 1
+        mpc, config = in_units_of(known.mpc, known.table), self._adapting(known.model_error)
+        return ParameterTraining(mpc, known.constant_value, known.table, known.groups, config, seed=known.seed)
 
-    def _adapting(self) -> ParameterConfig:
+    def _adapting(self, missed: float | None) -> ParameterConfig:
         """The configuration, without steps on a model that was identified and predicts well."""
-        config, missed = self._config, self.known.model_error
+        config = self._config
         if missed is None or not config.n_steps:
             return config
         if missed <= self._adapt_above:
@@ -163,37 +116,9 @@ class LearnParameters(Stage):
         )
         return config
 
-    def advance(self, n: int) -> Metrics:
-        """Makes n more steps, fewer before the last, which is made alone."""
-        if self._training.done:
-            self.step = self.n_steps
-            return {"fit_loss": self._result().loss_after}
-        metrics = self._training.advance(n)
-        self.step, self._found = self._training.step, None
-        return metrics
-
-    def _result(self) -> FitResult:
-        """What is found from where the steps have come to: once, for it takes seconds."""
-        if self._found is None:
-            self._found = self._training.finish()
-        return self._found
-
-    def outcome(self) -> Known:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        result = self._result()
-        return replace(self.known, mpc=self.known.mpc.with_theta(result.theta), result=result)
-
-    def to_arrays(self) -> Arrays:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        return self._training.to_arrays() | {"done": np.array(self.done)}
-
-    def restore(self, arrays: Arrays) -> None:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        self._training.restore(arrays)
-        done = arrays.get("done")
-        if done is None or done.shape or done.dtype != bool or (done and not self._training.done):
-            raise FileFormatError("state of (FIT)", expected="whether it was done", actual=repr(done)[:100])
-        self.step = self.n_steps if done else self._training.step
+    def outcome(self, known: Known, training: Training) -> Known:
+        """Adds theta and the result."""
+        return replace(known, mpc=known.mpc.with_theta(training.result.theta), result=training.result)
 
 
 @dataclass(frozen=True)
@@ -214,39 +139,23 @@ class TerminalConfig:
         check_number("blend", self.blend, 0.0, 1.0, open_low=False)
 
 
-class FitTerminal(Stage):
-    """The terminal cost: T = V - Phi, or none from V.
-
-    Args:
-        config: Which.
-    """
-
-    quick = True
-
-    def __init__(self, config: TerminalConfig) -> None:
-        self._config = config
-
-    def outcome(self) -> Known:
-        """See :class:`~mpcoffline.learning.stages.Stage`."""
-        known, kind = self.known, self._config.method
-        if kind == "given":
-            return known
-        goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
-        if kind == "norm":
-            return _with_terminal_cost(known, NormCost(goal))
+def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
+    """The MPC with the terminal cost that is asked for: T = V - Phi, or none from V."""
+    kind = config.method
+    if kind == "given":
+        return known
+    goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
+    cost: TerminalCost = NormCost(goal)
+    if kind != "norm":
         value, potential = known.constant_value, None if known.result is None else known.result.potential
-        terminal_cost = fit_terminal(
+        cost = fit_terminal(
             kind,
             value if potential is None else lambda s: value(s) - potential(s),
             known.table.sample(_TERMINAL_ROWS, 0).observations,
             x_ref=goal,
-            blend=self._config.blend,
+            blend=config.blend,
             seed=known.seed,
         )
-        return _with_terminal_cost(known, terminal_cost)
-
-
-def _with_terminal_cost(known: Known, cost: TerminalCost) -> Known:
     mpc = known.mpc.replace(terminal_cost=cost)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
 

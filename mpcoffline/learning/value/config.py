@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from mpcoffline.core.checks import check_integers, check_known, check_number
 
-from .methods import VALUE_METHODS, ValueMethod, check_tau, method_from_json
+from .methods import VALUE_METHODS, ValueMethod, check_tau, method_from_json, method_to_json
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,6 @@ class ValueConfig:
     patience: int = 2_000
 
     def __post_init__(self) -> None:
-        if isinstance(self.method, Mapping):  # as a file has it
-            object.__setattr__(self, "method", method_from_json(self.method))
         if not isinstance(self.method, ValueMethod):
             check_known("value method", self.method, ("auto", *VALUE_METHODS))
         check_tau(self.tau)
@@ -67,6 +65,26 @@ class ValueConfig:
         kind: Any = VALUE_METHODS[("iql" if noisy else "expectile") if self.method == "auto" else self.method]
         method: ValueMethod = kind(tau=self.tau) if hasattr(kind, "tau") else kind()
         return method
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description; of a method of one's own, its name and its fields.
+
+        Raises:
+            InvalidArgumentError: For a method that no file can hold.
+        """
+        how = self.method if isinstance(self.method, str) else method_to_json(self.method)
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"hidden": list(self.hidden), "method": how}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> ValueConfig:
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FileFormatError: For a method that nobody has registered.
+        """
+        how = data["method"]
+        method = method_from_json(how) if isinstance(how, dict) else how
+        return cls(**(dict(data) | {"hidden": tuple(data["hidden"]), "method": method}))
 
 
 def cosine(step: int, n_steps: int) -> float:

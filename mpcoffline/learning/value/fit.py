@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.progress import OnEpoch, silent
 
 from .config import ValueConfig, cosine
 from .function import ValueFunction
@@ -35,8 +34,6 @@ def fit_value(
     *,
     seed: int,
     device: str = "cpu",
-    epoch: int = 500,
-    report: OnEpoch = silent,
 ) -> ValueFunction:
     """Learns V_phi by stochastic gradient descent on one of the losses: a :class:`ValueTraining` from start to end.
 
@@ -46,8 +43,6 @@ def fit_value(
         config: Loss and schedule.
         seed: Seeds weights and minibatches; the same seed gives the same weights on the same machine.
         device: Torch device.
-        epoch: Steps between reports.
-        report: Called at the end of each epoch with what :meth:`ValueTraining.advance` returns.
 
     Returns:
         The value function, in evaluation mode and without gradients.
@@ -56,7 +51,5 @@ def fit_value(
         MPCOfflineError: If the loss stays NaN or infinite.
     """
     training = ValueTraining(table, discount, config, seed=seed, device=device)
-    while not training.done:
-        metrics = training.advance(epoch)
-        report(training.step, training.n_steps, metrics)
+    training.advance(training.n_steps)
     return training.result

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from mpcoffline.core.errors import FileFormatError, MPCOfflineError
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
-from mpcoffline.learning.progress import Metrics
 
 from .config import ValueConfig, cosine
 from .function import ValueFunction, tanh_network
@@ -89,7 +88,7 @@ class ValueTraining:
         stalled = self._validation is not None and 0 < patience <= self.step - self._best_step
         return stalled or self.step >= self.n_steps
 
-    def advance(self, n: int) -> Metrics:
+    def advance(self, n: int) -> dict[str, float]:
         """Makes n more steps, fewer at the end.
 
         Returns:

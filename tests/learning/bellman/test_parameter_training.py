@@ -66,9 +66,9 @@ def test_going_on_gives_the_same_bits(stops: tuple[int, ...]) -> None:
         part.restore(arrays)
         assert part.step == stop
     part.advance(60 - part.step)
-    assert part.done
+    assert part.step == part.n_steps - 1
     np.testing.assert_array_equal(part.theta, whole.theta)
-    np.testing.assert_array_equal(part.finish().theta, whole.finish().theta)
+    np.testing.assert_array_equal(part.result.theta, whole.result.theta)
 
 
 def test_the_prediction_error_is_its_formula() -> None:
@@ -128,9 +128,9 @@ def test_a_fit_that_runs_off_begins_again_and_says_so(caplog: pytest.LogCaptureF
     with caplog.at_level(logging.WARNING):
         while not fit.done:
             fit.advance(5)
-    assert fit.attempt == 2
+    assert (fit.attempt, fit.step, fit.n_steps) == (2, 6, 6)
     assert "starting again beside theta_0 (1 of at most 2 restarts)" in caplog.text
-    result = fit.finish()
+    result = fit.result
     assert "failed in every attempt; the model stays as it was" in caplog.text
     mpc = lq_plant.make_mpc()
     np.testing.assert_array_equal(mpc.with_theta(result.theta).values["model.A"], lq_plant.MODEL_A)
@@ -148,7 +148,7 @@ def test_a_fixed_parameter_is_on_no_bound() -> None:
     )
     fit = training(lq_plant.make_mpc().replace(model=model), n_steps=5)
     fit.advance(5)
-    assert fit.finish().at_bounds == ()
+    assert fit.result.at_bounds == ()
 
 
 def test_parameters_that_end_on_a_bound_are_named(caplog: pytest.LogCaptureFixture) -> None:
@@ -163,7 +163,7 @@ def test_parameters_that_end_on_a_bound_are_named(caplog: pytest.LogCaptureFixtu
     fit = training(lq_plant.make_mpc().replace(model=model), n_steps=200, prior=0.0)
     while not fit.done:
         fit.advance(100)
-    result = fit.finish()
+    result = fit.result
     assert result.at_bounds == ("model.gain",)
     assert "ended on the bounds of model.gain" in caplog.text
 
@@ -171,7 +171,8 @@ def test_parameters_that_end_on_a_bound_are_named(caplog: pytest.LogCaptureFixtu
 def test_no_gradient_steps_leave_the_model_to_identification() -> None:
     mpc = lq_plant.make_mpc()
     fit = training(mpc, n_steps=0)
+    assert fit.advance(5) == {"fit_loss": fit.result.loss_after}
     assert fit.done
-    result = fit.finish()
+    result = fit.result
     np.testing.assert_array_equal(mpc.with_theta(result.theta).values["model.A"], lq_plant.MODEL_A)
     assert result.loss_after < result.loss_before

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.learning import FitResult, ParameterConfig, ValueFunction, fit_parameters
+from mpcoffline.learning import FitResult, ParameterConfig, ParameterTraining, ValueFunction, fit_parameters
 from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.mpc.coordinates import Coordinates, canonical
@@ -413,20 +413,20 @@ def test_a_gradient_that_is_not_finite_is_skipped(monkeypatch: pytest.MonkeyPatc
         return honest(self, batch, theta) * (torch.nan if calls % 3 == 0 else 1.0)
 
     monkeypatch.setattr(BellmanProblem, "error", faulty)
-    reports: list[dict[str, float]] = []
-    result = fit_parameters(
+    training = ParameterTraining(
         lq_plant.make_mpc(),
         QuadraticValue(BEST.P),
         lq_plant.random_log(300),
         BOTH,
         ParameterConfig(n_steps=50),
         seed=0,
-        report=lambda done, total, metrics: reports.append(metrics),
     )
+    losses = [training.advance(25)["fit_loss"] for _ in range(3)]
+    result = training.result
     assert calls > 50
     assert np.isfinite(result.theta).all()
     assert result.loss_after < result.loss_before
-    assert all(np.isfinite(metrics["fit_loss"]) for metrics in reports)
+    assert np.isfinite(losses).all()
 
 
 def test_a_model_that_is_not_finite_on_the_data_is_refused() -> None:
@@ -449,21 +449,17 @@ def test_the_seed_decides_every_bit() -> None:
     assert (first.theta != other.theta).any()
 
 
-def test_reports_lead_to_the_end() -> None:
-    calls: list[tuple[int, int]] = []
+def test_steps_lead_to_the_end() -> None:
+    steps: list[tuple[int, int]] = []
     options = ParameterConfig(n_steps=25, refit_iterations=10)
     for groups in (BOTH, COST):
-        fit_parameters(
-            lq_plant.make_mpc(),
-            QuadraticValue(BEST.P),
-            noisy_log(100),
-            groups,
-            options,
-            seed=0,
-            epoch=10,
-            report=lambda done, total, metrics: calls.append((done, total)),
+        training = ParameterTraining(
+            lq_plant.make_mpc(), QuadraticValue(BEST.P), noisy_log(100), groups, options, seed=0
         )
-    assert calls == [(10, 26), (20, 26), (25, 26), (26, 26), (1, 1)]
+        while not training.done:
+            training.advance(10)
+            steps.append((training.step, training.n_steps))
+    assert steps == [(10, 26), (20, 26), (25, 26), (26, 26), (1, 1)]
 
 
 def test_a_large_table_is_refitted_on_a_subset() -> None:

@@ -15,7 +15,7 @@ from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import VALUE_METHODS, ValueConfig, ValueMethod
 from mpcoffline.learning.value.fit import Expectile, ImplicitQ, TemporalDifference
-from mpcoffline.learning.value.methods import Critic, method_to_json, sampled_target
+from mpcoffline.learning.value.methods import Critic, sampled_target
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 
 
@@ -60,7 +60,7 @@ def test_a_registered_one_is_saved_with_its_fields(tmp_path: Path, monkeypatch: 
     for value in (Huber(0.5), "huber", ImplicitQ(0.2)):
         OfflineMPCLearner(mpc(), value=value).save(tmp_path / "l.zip")
         assert OfflineMPCLearner.load(tmp_path / "l.zip").method.value.method == value
-    data = json.loads(json.dumps(method_to_json(Huber(0.5))))
+    data = json.loads(json.dumps(ValueConfig(Huber(0.5)).to_json()))
     monkeypatch.undo()
     with pytest.raises(FileFormatError, match=r"expected a value method that is known here .* import what registers"):
-        ValueConfig(data)  # type: ignore[arg-type]
+        ValueConfig.from_json(data)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.learning import VALUE_METHODS, ValueConfig, ValueFunction, fit_value
+from mpcoffline.learning import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
 from mpcoffline.learning.value.fit import Expectile, Residual, TemporalDifference, ValueMethod
 
 Array = NDArray[np.float64]
@@ -23,17 +23,12 @@ SMALL: dict[str, Any] = {"hidden": (32, 32), "n_steps": 1_000, "learning_rate": 
 
 @cache
 def learned(method: str, tau: float = 0.3) -> tuple[ValueFunction, float]:
-    """V of the logging policy's transitions, and the last reported loss."""
-    losses: list[float] = []
+    """V of the logging policy's transitions, and the loss over the last half."""
     config = ValueConfig(method=method, tau=tau, **SMALL)
-    value = fit_value(
-        lq_plant.policy_log(4_000),
-        lq_plant.DISCOUNT,
-        config,
-        seed=0,
-        report=lambda done, total, metrics: losses.append(metrics["value_loss"]),
-    )
-    return value, losses[-1]
+    training = ValueTraining(lq_plant.policy_log(4_000), lq_plant.DISCOUNT, config, seed=0)
+    training.advance(500)
+    loss = training.advance(500)["value_loss"]
+    return training.result, loss
 
 
 @pytest.mark.parametrize("method", ["residual", "td"])
@@ -236,18 +231,6 @@ def test_the_seed_decides_every_bit() -> None:
         np.testing.assert_array_equal(again[name], array)
     assert any((other[name] != first[name]).any() for name in first)
     assert torch.equal(torch.random.get_rng_state(), state)  # the caller's generator is left alone
-
-
-def test_reports_come_once_an_epoch_and_at_the_end() -> None:
-    calls: list[tuple[int, int]] = []
-    config = ValueConfig(hidden=(4,), n_steps=25)
-
-    def report(done: int, total: int, metrics: dict[str, float]) -> None:
-        calls.append((done, total))
-        assert metrics["value_loss"] > 0.0
-
-    fit_value(lq_plant.random_log(50), 0.9, config, seed=0, epoch=10, report=report)
-    assert calls == [(10, 25), (20, 25), (25, 25)]
 
 
 @pytest.mark.parametrize(

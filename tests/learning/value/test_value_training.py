@@ -107,9 +107,7 @@ def test_fit_value_is_the_training_from_start_to_end() -> None:
     running.advance(config.n_steps + 5)
     assert running.done
     assert running.step == running.n_steps == 30
-    same_arrays(
-        fit_value(lq_plant.random_log(300), 0.9, config, seed=0, epoch=7).to_arrays(), running.result.to_arrays()
-    )
+    same_arrays(fit_value(lq_plant.random_log(300), 0.9, config, seed=0).to_arrays(), running.result.to_arrays())
 
 
 @pytest.mark.parametrize("damage", ["missing", "other network", "other method"])
@@ -184,11 +182,11 @@ def test_learning_stops_when_the_validation_loss_no_longer_falls() -> None:
     config = ValueConfig(
         hidden=(64, 64), n_steps=8_000, batch_size=32, validation=0.5, learning_rate=1e-2, patience=VALIDATE_EVERY
     )
-    reports: list[int] = []
-    table = lq_plant.random_log(64)
-    fit_value(table, 0.9, config, seed=0, epoch=100, report=lambda done, total, metrics: reports.append(done))
-    assert reports[-1] < 8_000
-    assert reports[-1] % VALIDATE_EVERY == 0
+    running = ValueTraining(lq_plant.random_log(64), 0.9, config, seed=0)
+    running.advance(8_000)
+    assert running.done
+    assert running.step < 8_000
+    assert running.step % VALIDATE_EVERY == 0
 
 
 def test_one_episode_is_learned_from_whole_and_that_is_said(caplog: pytest.LogCaptureFixture) -> None:

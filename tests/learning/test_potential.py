@@ -12,7 +12,7 @@ from lq_plant import BEST, DISCOUNT, MODEL_A, MODEL_B, QuadraticValue
 from riccati import optimum
 
 from mpcoffline.learning import FitResult, ParameterConfig, fit_parameters
-from mpcoffline.learning.bellman.potential import Potential
+from mpcoffline.learning.potential import Potential
 from mpcoffline.mpc import MPC
 
 
