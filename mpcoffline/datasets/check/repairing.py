@@ -7,7 +7,6 @@ import importlib.metadata
 import json
 import os
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from mpcoffline.core.atomic import publish
 from mpcoffline.core.errors import FileFormatError, StorageError, UnknownIdError
 from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import METADATA_BYTES
+from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.record.recording import seal
 from mpcoffline.datasets.store.hdf5_guard import check_episodes, episode_number
@@ -143,27 +143,24 @@ def _repair_stored(dataset_id: str, env_spec: EnvSpec | None) -> RepairReport:
 
 def _rebuild(dataset_id: str, file: Any, names: list[str], metadata: dict[str, Any]) -> Path:
     """Puts a data set of these groups of a file in the place of the damaged one; returns where that is kept."""
-    target, building = dataset_path(dataset_id), None
+    target = dataset_path(dataset_id)
     try:
         free, needed = shutil.disk_usage(dataset_path("")).free, int(Path(file.filename).stat().st_size) + (1 << 20)
         if free < needed:  # HDF5 itself must not meet a full disk: it would end the process
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        building = Path(tempfile.mkdtemp(prefix=".building-", dir=dataset_path("")))
-        data = building / "data"
-        data.mkdir()
-        with h5py.File(data / DATA_FILE, "w", track_order=True) as new:
-            for number, name in enumerate(names):
-                file.copy(name, new, f"episode_{number}")
-                new[f"episode_{number}"].attrs["id"] = number
-        (data / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
-        finish(building, {})
-        backup = _back_up(dataset_id)
-        publish(building, target, overwrite=True)
+        with scratch_folder(dataset_path("")) as building:
+            data = building / "data"
+            data.mkdir()
+            with h5py.File(data / DATA_FILE, "w", track_order=True) as new:
+                for number, name in enumerate(names):
+                    file.copy(name, new, f"episode_{number}")
+                    new[f"episode_{number}"].attrs["id"] = number
+            (data / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
+            finish(building, {})
+            backup = _back_up(dataset_id)
+            publish(building, target, overwrite=True)
     except (OSError, RuntimeError, shutil.Error) as error:
         raise StorageError.of(target, error) from error
-    finally:
-        if building is not None:
-            shutil.rmtree(building, ignore_errors=True)
     return backup
 
 
@@ -171,8 +168,6 @@ def _open(path: Path) -> Any:
     try:
         check_regular(path)
         return h5py.File(path, "r")
-    except FileFormatError:
-        raise
     except OSError as error:
         raise _unreadable(path, error) from error
 

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,16 +22,7 @@ from mpcoffline.datasets import clean, dataset_from_arrays, list_datasets, load_
 from mpcoffline.datasets.check.cleaning import Kind
 from mpcoffline.datasets.store.recording_lock import RecordingLock
 
-
-@pytest.fixture(autouse=True)
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A store, a cache and temporary files of the test's own."""
-    for name in ("store", "temporary"):
-        (tmp_path / name).mkdir()
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "store"))
-    monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("machine")
 
 
 def episode(steps: int = 20) -> tuple[Any, Any, Any]:
