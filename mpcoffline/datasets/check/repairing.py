@@ -25,7 +25,7 @@ from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.record.recording import seal
 from mpcoffline.datasets.store.hdf5_guard import check_episodes, episode_number
-from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
+from mpcoffline.datasets.store.ids import backup_path, check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.local import list_datasets
 from mpcoffline.datasets.store.manifest import MANIFEST, differences
 from mpcoffline.datasets.store.opening import DATA_FILE, check_space, open_dataset
@@ -106,7 +106,7 @@ def repair(dataset_id: str, *, env_spec: EnvSpec | None = None, salvage: bool = 
 
 
 def _repair_stored(dataset_id: str, env_spec: EnvSpec | None) -> RepairReport:
-    path = dataset_path(dataset_id) / "data" / "main_data.hdf5"
+    path = dataset_path(dataset_id) / "data" / DATA_FILE
     metadata = _metadata(dataset_id)
     if metadata.get("data_format", "hdf5") != "hdf5":
         raise FileFormatError(
@@ -325,13 +325,9 @@ def _is_readable(dataset_id: str) -> bool:
 
 def _back_up(dataset_id: str) -> Path:
     """Keeps the folder as it is under another, hidden name: links where they can be, so that it needs no room yet."""
-    source, number = dataset_path(dataset_id), 0
-    start = dataset_path("") / ".broken" / dataset_id
-    start = start.with_name(os.fsdecode(os.fsencode(start.name)[:240]))  # names of files end at 255 bytes
-    while (backup := start.with_name(f"{start.name}-{number}")).exists():
-        number += 1
+    backup = backup_path(dataset_id)
     backup.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)
+    shutil.copytree(dataset_path(dataset_id), backup, copy_function=_link_or_copy, ignore=_special)
     return backup
 
 
