@@ -76,16 +76,18 @@ def cache_folders(kind: str) -> Iterator[Path]:
     yield _temporary_folder(kind)
 
 
-def private_folder(folder: Path, kind: str) -> Path:
+def private_folder(folder: Path | None, kind: str) -> Path:
     """A folder that a user chose; a temporary one where it exists and others own it or can write it.
 
     Args:
-        folder: The folder.
-        kind: What it is for, as for :func:`cache_folder`.
+        folder: The folder; None for :func:`cache_folder`.
+        kind: What it is for, as there.
 
     Raises:
         StorageError: Where there is no such folder.
     """
+    if folder is None:
+        return cache_folder(kind)
     return folder if not folder.exists() or _is_made_private(folder) else _temporary_folder(kind)
 
 

@@ -10,7 +10,7 @@ import torch
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import Identification, OneStepProblem, without_jumps
+from mpcoffline.estimation.identification import Identification, OneStepProblem, Transitions, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 

@@ -1,5 +1,5 @@
 """A Minari store of its own for every test."""
 
-from own_store import store
+from own_store import machine, store
 
-__all__ = ["store"]
+__all__ = ["machine", "store"]

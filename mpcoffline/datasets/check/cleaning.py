@@ -15,7 +15,8 @@ from mpcoffline.core.places import cache_root, temporary_root
 from mpcoffline.core.scratch import abandoned, is_free, remove_abandoned
 from mpcoffline.datasets.record.recording import seal
 from mpcoffline.datasets.record.resuming import sealed_recordings
-from mpcoffline.datasets.store.ids import dataset_path
+from mpcoffline.datasets.store.ids import BACKUPS, DOWNLOADS, dataset_path
+from mpcoffline.datasets.store.manifest import MANIFEST
 from mpcoffline.datasets.store.recording_lock import empty_recordings, recording_path, remove_empty
 
 Kind = Literal["leftovers", "caches", "downloads", "backups"]
@@ -149,16 +150,16 @@ def _caches() -> Iterator[Waste]:
 
 
 def _downloads() -> Iterator[Waste]:
-    root = dataset_path("") / ".downloading"
+    root = dataset_path("") / DOWNLOADS
     for folder in sorted(root.iterdir()) if root.is_dir() else ():
         if folder.is_dir() and is_free(folder.with_name(f"{folder.name}.lock")):
             yield Waste("downloads", folder, disk_size(folder))
 
 
 def _backups() -> Iterator[Waste]:
-    root = dataset_path("") / ".broken"
+    root = dataset_path("") / BACKUPS
     for folder, below, _ in os.walk(root):
-        if "data" in below or Path(folder).joinpath("SHA256SUMS").exists() or any(Path(folder).glob("env-*.log")):
+        if "data" in below or Path(folder).joinpath(MANIFEST).exists() or any(Path(folder).glob("env-*.log")):
             below.clear()
             yield Waste("backups", Path(folder), disk_size(Path(folder)))
 

@@ -25,11 +25,11 @@ from mpcoffline.core.text import visible
 from mpcoffline.datasets.record.recording import seal
 from mpcoffline.datasets.store.hdf5_guard import check_episodes, episode_number
 from mpcoffline.datasets.store.hdf5_writing import SteadyFile, checked, write_steadily
-from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
+from mpcoffline.datasets.store.ids import backup_path, check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.local import list_datasets
 from mpcoffline.datasets.store.manifest import MANIFEST, differences
 from mpcoffline.datasets.store.opening import DATA_FILE, check_space, open_dataset
-from mpcoffline.datasets.store.recording_lock import RecordingLock, kept_path, log_files, recording_path
+from mpcoffline.datasets.store.recording_lock import RecordingLock, log_files, recording_path
 from mpcoffline.datasets.store.writing import finish, recording_of
 
 _STEPS = ("actions", "rewards", "terminations", "truncations")
@@ -169,8 +169,6 @@ def _open(path: Path) -> Any:
     try:
         check_regular(path)
         return h5py.File(path, "r")
-    except FileFormatError:
-        raise
     except OSError as error:
         raise _unreadable(path, error) from error
 
@@ -328,7 +326,7 @@ def _is_readable(dataset_id: str) -> bool:
 
 def _back_up(dataset_id: str) -> Path:
     """Keeps the folder as it is under another, hidden name: links where they can be, so that it needs no room yet."""
-    source, backup = dataset_path(dataset_id), kept_path(dataset_id)
+    source, backup = dataset_path(dataset_id), backup_path(dataset_id)
     backup.parent.mkdir(parents=True, exist_ok=True)
     try:
         shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)

@@ -26,7 +26,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, Invali
 from mpcoffline.core.outputs import write_file
 from mpcoffline.core.progress import Bars
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
+from mpcoffline.datasets.store.ids import DOWNLOADS, check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.manifest import MANIFEST, differences, read_manifest, sha256_of, write_manifest
 from mpcoffline.datasets.store.opening import open_dataset
 from mpcoffline.datasets.store.recording_lock import check_not_recorded
@@ -292,7 +292,7 @@ def _check(staged: Path, dataset_id: str, source: Source, *, unchecked: bool) ->
 @contextmanager
 def _download_folder(dataset_id: str) -> Iterator[Path]:
     """A folder of this process alone, hidden from Minari, that is still there at the next attempt."""
-    root = dataset_path("") / ".downloading"
+    root = dataset_path("") / DOWNLOADS
     label = dataset_id.replace("/", "--")
     if len(os.fsencode(label)) > 200:  # names of files end at 255 bytes
         label = hashlib.sha256(os.fsencode(dataset_id)).hexdigest()

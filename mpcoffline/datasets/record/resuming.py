@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, StorageError
-from mpcoffline.datasets.store.ids import dataset_path, is_local
+from mpcoffline.datasets.store.ids import backup_path, dataset_path, is_local
 from mpcoffline.datasets.store.opening import read_metadata
-from mpcoffline.datasets.store.recording_lock import kept_path, log_files
+from mpcoffline.datasets.store.recording_lock import log_files
 from mpcoffline.datasets.store.writing import recording_of
 
 from .episode_log import LogIndex, scan
@@ -109,7 +109,7 @@ def _plants(first: str | None, second: str | None) -> tuple[str | None, str | No
 
 def set_aside(dataset_id: str) -> Path:
     """Moves the logs to where nobody continues them; moved back, they can be repaired."""
-    kept = kept_path(dataset_id, "-recording")
+    kept = backup_path(dataset_id, "-recording")
     try:
         kept.mkdir(parents=True)
         for path in log_files(dataset_id):

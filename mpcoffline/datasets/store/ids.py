@@ -12,6 +12,7 @@ GRAMMAR = (
     "(namespace/)*name-vN of letters, digits, '-' and '_' (no dots; a namespace has two characters or more, is not"
     " 'data' and does not end in -vN itself; at most 255 bytes a part, 1024 in all)"
 )
+RECORDINGS, DOWNLOADS, BACKUPS = ".recording", ".downloading", ".broken"  # folders of the store, hidden from Minari
 ID_LENGTH = 1024
 PART_BYTES = 255  # what file systems take
 _VERSION = re.compile(r"-v\d+")
@@ -61,3 +62,12 @@ def dataset_path(dataset_id: str) -> Path:
 def is_local(dataset_id: str) -> bool:
     """Whether the local Minari store holds the data set."""
     return (dataset_path(dataset_id) / "data").exists()
+
+
+def backup_path(dataset_id: str, ending: str = "") -> Path:
+    """A folder in which something of a data set can be kept: hidden, and not there yet."""
+    start, number = dataset_path("") / BACKUPS / dataset_id, 0
+    begin = os.fsdecode(os.fsencode(start.name)[: PART_BYTES - 15 - len(ending)]) + ending
+    while (kept := start.with_name(f"{begin}-{number}")).exists():
+        number += 1
+    return kept

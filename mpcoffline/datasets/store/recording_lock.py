@@ -16,26 +16,17 @@ from pathlib import Path
 
 from mpcoffline.core.errors import InvalidArgumentError, StorageError
 
-from .ids import dataset_path
+from .ids import RECORDINGS, dataset_path
 
 
 def recording_path(dataset_id: str) -> Path:
     """The folder of a data set's logs, whether it exists or not."""
-    return dataset_path("") / ".recording" / dataset_id
+    return dataset_path("") / RECORDINGS / dataset_id
 
 
 def log_files(dataset_id: str) -> list[Path]:
     """The logs of a data set that have not been sealed."""
     return sorted(recording_path(dataset_id).glob("env-*.log"))
-
-
-def kept_path(dataset_id: str, kind: str = "") -> Path:
-    """A hidden folder that does not exist yet, for what is kept of a data set or of its logs."""
-    start = dataset_path(f".broken/{dataset_id}")
-    begin, number = os.fsdecode(os.fsencode(start.name)[:230]), 0  # names of files end at 255 bytes
-    while (kept := start.with_name(f"{begin}{kind}-{number}")).exists():
-        number += 1
-    return kept
 
 
 def check_not_recorded(dataset_id: str) -> None:
@@ -173,7 +164,7 @@ def empty_recordings() -> list[Path]:
         below = [] if any(path.parent == folder for path in files) else sorted(folder.iterdir())
         return [found for part in below if part.is_dir() for found in outermost(part)]
 
-    root = dataset_path("") / ".recording"
+    root = dataset_path("") / RECORDINGS
     return outermost(root) if root.is_dir() else []
 
 
@@ -182,7 +173,7 @@ def remove_empty(folder: Path) -> None:
     held = {path.parent for name in ("lock", "env-*.new") for path in folder.rglob(name)}
     for path in sorted(held):
         with contextlib.suppress(InvalidArgumentError, StorageError):
-            RecordingLock(path.relative_to(dataset_path("") / ".recording").as_posix()).release()
+            RecordingLock(path.relative_to(dataset_path("") / RECORDINGS).as_posix()).release()
     for path in sorted([folder, *folder.rglob("*")], reverse=True):
         with contextlib.suppress(OSError):
             path.rmdir()

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidDataError, StorageError
+from mpcoffline.core.places import private_folder
 from mpcoffline.datasets.store.opening import DATA_FILE, check_stored
 
-from .cache import TableFile, cached_table, content_key, scratch_table, table_folder
+from .cache import TableFile, cached_table, content_key, scratch_table
 from .centring import Centring, Digits
 from .hdf5_episodes import EpisodeColumns, read_episodes
 from .math import CHUNK
@@ -80,11 +81,11 @@ def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path | No
     path = _hdf5_file(dataset)
     source = _Source(dataset, name, ny, nu)
     if mapped and path is None:
-        file = scratch_table(ny, nu, source.blocks(), table_folder(cache))
+        file = scratch_table(ny, nu, source.blocks(), private_folder(cache, "tables"))
         again = source.again()
-        return file if again is None else scratch_table(ny, nu, again[0], table_folder(cache), again[1])
+        return file if again is None else scratch_table(ny, nu, again[0], private_folder(cache, "tables"), again[1])
     if path is not None and (mapped or steps >= CACHED_ROWS):
-        cache = table_folder(cache)
+        cache = private_folder(cache, "tables")
         try:
             file = _cached(source, path, cache)
             if mapped:

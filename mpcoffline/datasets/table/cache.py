@@ -26,7 +26,7 @@ from mpcoffline.core.atomic import publish
 from mpcoffline.core.caches import mark_used, read_note, trim, write_note
 from mpcoffline.core.errors import FileFormatError, StorageError
 from mpcoffline.core.limits import TABLE_META_BYTES, check_limit
-from mpcoffline.core.places import cache_folder, open_own, private_folder
+from mpcoffline.core.places import open_own
 from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.datasets.store.manifest import sha256_of
 
@@ -301,18 +301,6 @@ def content_key(path: Path, episodes: NDArray[Any] | None, cache: Path) -> str:
             write_note(cache, path, {"signature": signature, "sha256": digest})
     chosen = b"" if episodes is None else np.ascontiguousarray(episodes, np.int64).tobytes()
     return hashlib.sha256(digest.encode() + chosen).hexdigest()[:40]
-
-
-def table_folder(chosen: Path | None) -> Path:
-    """Where tables are kept, in a folder of the user's alone; it can be removed at any time.
-
-    Args:
-        chosen: The folder; None for ``tables`` in that of all caches.
-
-    Raises:
-        StorageError: Where there is no folder to keep anything in.
-    """
-    return cache_folder("tables") if chosen is None else private_folder(chosen, "tables")
 
 
 def default_memory() -> int:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,16 +28,7 @@ from mpcoffline.datasets.store.recording_lock import RecordingLock
 
 SPACES = {"observation_space": crashing.SPACE, "action_space": crashing.ACTIONS}
 
-
-@pytest.fixture(autouse=True)
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A store, a cache and temporary files of the test's own."""
-    for name in ("store", "temporary"):
-        (tmp_path / name).mkdir()
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "store"))
-    monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("machine")
 
 
 def episode(steps: int = 20) -> tuple[Any, Any, Any]:

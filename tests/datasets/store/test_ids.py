@@ -14,7 +14,7 @@ from pendulum_data import stored
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.datasets import list_datasets, load_dataset, verify
-from mpcoffline.datasets.store.ids import is_valid_id
+from mpcoffline.datasets.store.ids import backup_path, is_valid_id
 
 
 @pytest.mark.parametrize(
@@ -95,3 +95,15 @@ def test_a_store_with_folders_of_such_names_stays_usable(store: Path) -> None:
         load_dataset("mine/god-v0")
     with pytest.raises(InvalidArgumentError, match="not 'data'"):
         stored("data/pump-v0")
+
+
+@pytest.mark.parametrize("ending", ["", "-recording"])
+def test_whatever_has_a_valid_id_can_be_kept(ending: str) -> None:
+    longest = "aa/" + "x" * 252 + "-v0"
+    assert is_valid_id(longest)
+    kept = [backup_path(longest, ending)]
+    for _ in range(2):
+        kept[-1].mkdir(parents=True)
+        kept.append(backup_path(longest, ending))
+    assert len(set(kept)) == 3
+    assert {path.parent.parent.name for path in kept} == {".broken"}

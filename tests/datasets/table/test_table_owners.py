@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +18,10 @@ OTHER = 12345
 
 
 @pytest.fixture(autouse=True)
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A store, a cache and temporary files of the test's own; every table is large enough for the cache."""
-    for name in ("store", "temporary"):
-        (tmp_path / name).mkdir()
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "store"))
-    monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+def every_table_is_cached(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every table is large enough for the cache."""
     monkeypatch.setattr(table_build, "CACHED_ROWS", 1)
     places.warn_once.cache_clear()
-    return tmp_path
 
 
 def stored(name: str = "mine/plant/log-v0", seed: int = 0) -> str:
