@@ -1,4 +1,4 @@
-"""The three tasks of arXiv:2301.01667 as Gymnasium environments.
+"""The tasks of arXiv:2301.01667 as Gymnasium environments, and the door for others: one file a plant.
 
 Importing this package registers ``mpcoffline/LinearTracking-v0``, ``mpcoffline/PendulumSwingUp-v0`` and
 ``mpcoffline/CartPoleSwingUp-v0``. It needs numpy and gymnasium only, and pygame to draw.
@@ -6,30 +6,30 @@ Importing this package registers ``mpcoffline/LinearTracking-v0``, ``mpcoffline/
 
 from __future__ import annotations
 
-import gymnasium as gym
-
 from .base import ControlTask
-from .cartpole_swing_up import CartPoleSwingUpEnv
-from .episode import EPISODE_STEPS
 from .linear_tracking import LinearTrackingEnv
 from .pendulum_swing_up import PendulumSwingUpEnv
 
-__all__ = ["ENV_IDS", "CartPoleSwingUpEnv", "ControlTask", "LinearTrackingEnv", "PendulumSwingUpEnv"]
+from .cartpole_swing_up import CartPoleSwingUpEnv  # isort: skip -- the order of the list of plants
+from .plant import Input, Nominal, Parameter, Plant, State, Uniform
+from .registry import PLANTS, plant_of, register
 
-# One line a task. Strings: Minari stores the spec as JSON and could not rebuild an environment from a class.
-_TASKS = {
-    "mpcoffline/LinearTracking-v0": "linear_tracking:LinearTracking",
-    "mpcoffline/PendulumSwingUp-v0": "pendulum_swing_up:PendulumSwingUp",
-    "mpcoffline/CartPoleSwingUp-v0": "cartpole_swing_up:CartPoleSwingUp",
-}
-#: The tasks with a nominal controller, labels in figures and a shipped data set.
-ENV_IDS = ("mpcoffline/LinearTracking-v0", "mpcoffline/PendulumSwingUp-v0", "mpcoffline/CartPoleSwingUp-v0")
+__all__ = [
+    "ENV_IDS",
+    "PLANTS",
+    "CartPoleSwingUpEnv",
+    "ControlTask",
+    "Input",
+    "LinearTrackingEnv",
+    "Nominal",
+    "Parameter",
+    "PendulumSwingUpEnv",
+    "Plant",
+    "State",
+    "Uniform",
+    "plant_of",
+    "register",
+]
 
-for _id, _name in _TASKS.items():
-    if _id not in gym.registry:
-        gym.register(
-            _id,
-            entry_point=f"mpcoffline.envs.{_name}Env",
-            vector_entry_point=f"mpcoffline.envs.{_name}VectorEnv",
-            max_episode_steps=EPISODE_STEPS,
-        )
+#: Gymnasium ids of the plants that come with this package; :data:`PLANTS` has those of others too.
+ENV_IDS = tuple(plant.id for plant in PLANTS.values())

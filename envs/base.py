@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, SupportsFloat
@@ -11,12 +12,20 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import Array, Start, checked_deviations, checked_render_mode, checked_start, checked_state
+from .arguments import (
+    Array,
+    Start,
+    checked_deviations,
+    checked_matrix,
+    checked_number,
+    checked_render_mode,
+    checked_start,
+    checked_state,
+)
+from .plant import Plant
 from .rendering import Canvas, Frame, Moment, Viewer
 
 Observation = NDArray[np.float32]
-
-SUCCESS_ANGLE = 0.3  # rad from upright, of both swing-ups
 
 
 def rk4(derivative: Callable[[Array, Array], Array], state: Array, action: Array, dt: float) -> Array:
@@ -48,10 +57,9 @@ def wrap_angle(angle: Array) -> Array:
 class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     r"""A control task with state s, observation y(s) and stage cost L(s, a); reward = -L.
 
-    A task states its plant and its cost as four functions of arrays with any leading dimensions
-    (:meth:`next_state`, :meth:`cost`, :meth:`observe`, :meth:`is_success`), how an episode starts
-    (:meth:`sample_state`) and what it looks like (:meth:`draw`); this class turns them into a Gymnasium environment.
-    A task sets its spaces and ``state_limit`` before it calls this class's ``__init__``.
+    A task states its plant, a :class:`Plant`, and what it looks like (:meth:`draw`); this class turns them into a
+    Gymnasium environment, whose arguments are the plant's parameters and those below. Its functions take arrays with
+    any leading dimensions. :func:`register` makes it known.
 
     The simulation runs in float64. Every ``info`` carries ``"cost"`` (the cost L(s_k, a_k) of the step just taken as
     float64; 0 at reset), ``"state"`` (the state s reached, float64) and ``"is_success"``. A task never
@@ -81,11 +89,14 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         measurement_noise: Standard deviation of v, a scalar or one a coordinate of s.
         render_mode: None, ``"human"`` (a window, redrawn in each step) or ``"rgb_array"`` (``render`` returns a
             picture).
+        **parameters: Parameters of the plant, which are attributes afterwards.
 
     Raises:
         ValueError: For an argument out of its range, of a wrong shape or not finite.
+        TypeError: For a parameter that the plant does not have.
 
     Attributes:
+        plant: What the task is about.
         dt: Sampling time in s.
         state_space: States that ``reset`` accepts.
         state_limit: Largest absolute values of the state in the simulation, ``(nx,)``; infinite for an angle.
@@ -96,9 +107,10 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012 -- gymnasium's
+    plant: ClassVar[Plant]
     dt: ClassVar[float]
-    starts: ClassVar[tuple[str, ...]] = ("broad",)
-    angle: ClassVar[int | None] = None
+    starts: ClassVar[tuple[str, ...]]
+    angle: ClassVar[int | None]
     picture_size: ClassVar[tuple[int, int]] = (600, 600)
     trail_steps: ClassVar[int] = 30
 
@@ -109,6 +121,20 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     _state: Array | None = None
     _noise_generator: np.random.Generator | None = None
 
+    def __init_subclass__(cls) -> None:
+        plant: Plant | None = getattr(cls, "plant", None)
+        if plant is None:
+            return
+        cls.dt, cls.starts, cls.angle = plant.dt, tuple(plant.starts), plant.angle
+        cls.metadata = cls.metadata | {"render_fps": round(1.0 / plant.dt)}
+        # What help() and documentation show: the parameters by name, then what every task takes.
+        common = list(inspect.signature(ControlTask.__init__).parameters.values())[1:-1]
+        own = list(inspect.signature(cls.__init__).parameters.values())[1:-1]
+        if cls.__init__ is ControlTask.__init__:
+            kind = inspect.Parameter.KEYWORD_ONLY
+            own = [inspect.Parameter(p.name, kind, default=p.value) for p in plant.parameters]
+        cls.__signature__ = inspect.Signature([*own, *common])  # type: ignore[attr-defined]
+
     def __init__(
         self,
         *,
@@ -116,33 +142,82 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         process_noise: ArrayLike = 0.0,
         measurement_noise: ArrayLike = 0.0,
         render_mode: str | None = None,
+        **parameters: Any,
     ) -> None:
-        nx = self.state_space.shape[0]
+        self._set_parameters(parameters)
+        plant, nx = self.plant, len(self.plant.states)
+        self.state_limit = np.array([np.inf if c.angle else c.limit for c in plant.states])
+        pairs = ([1.0, 1.0] if c.angle else [c.limit] for c in plant.states)
+        bound = np.array([limit for pair in pairs for limit in pair])
+        self.action_space = float32_box([c.low for c in plant.inputs], [c.high for c in plant.inputs])
+        self.observation_space = float32_box(-bound, bound)
+        self.state_space = float64_box(self.start_bound())
         self.start = self._checked_start("start", self.starts[0] if start is None else start)
         self.process_noise = checked_deviations("process_noise", process_noise, nx)
         self.measurement_noise = checked_deviations("measurement_noise", measurement_noise, nx)
         self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
         self._viewer = None if render_mode is None else self.new_viewer(render_mode)
 
-    @abstractmethod
+    def _set_parameters(self, given: dict[str, Any]) -> None:
+        known = {p.name: p for p in self.plant.parameters}
+        for name in given:
+            if name not in known:
+                raise TypeError(f"{type(self).__name__}.__init__() got an unexpected keyword argument {name!r}")
+        # Those whose limit depends on the others come last.
+        for name, p in sorted(known.items(), key=lambda item: callable(item[1].high)):
+            value, shape = given.get(name, p.value), np.shape(p.value)
+            if shape:
+                setattr(self, name, checked_matrix(name, value, shape))
+            else:
+                high = p.high(vars(self)) if callable(p.high) else p.high
+                setattr(self, name, checked_number(name, value, p.low, high, p.unit))
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The plant's parameters by name."""
+        return {p.name: getattr(self, p.name) for p in self.plant.parameters}
+
+    def start_bound(self) -> Array:
+        """The largest absolute values of a state that ``reset`` accepts, ``(nx,)``."""
+        return np.array([c.start for c in self.plant.states])
+
+    def derivative(self, state: Array, action: Array) -> Array:
+        """The equations of motion: ds/dt, ``(..., nx)``; the next state itself where the plant is discrete."""
+        return self._rates(state, _entries(action), self.parameters)
+
+    def _rates(self, state: Array, inputs: list[Array], parameters: dict[str, Any]) -> Array:
+        y = self.plant.lift(_entries(state), np.cos, np.sin)
+        return np.concatenate(self.plant.dynamics(y, inputs, parameters), axis=-1)
+
     def next_state(self, state: Array, action: Array) -> Array:
         """The plant without noise: f(s, a) for s ``(..., nx)`` and a ``(..., nu)`` within bounds."""
+        inputs, parameters = _entries(action), self.parameters
+        if self.plant.discrete:
+            return self.confined(self._rates(state, inputs, parameters))
+        return self.confined(rk4(lambda s, _: self._rates(s, inputs, parameters), state, action, self.dt))
 
-    @abstractmethod
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost L(s, a) >= 0, ``(...)``."""
+        return np.asarray(self.plant.cost(_entries(state), _entries(action)))[..., 0]
 
-    @abstractmethod
     def observe(self, state: Array) -> Observation:
         """The observation h(s) without noise, ``(..., ny)`` float32; smooth where s wraps."""
+        y = np.concatenate(self.plant.lift(_entries(state), np.cos, np.sin), axis=-1)
+        return y.astype(np.float32)
 
-    @abstractmethod
     def is_success(self, state: Array) -> NDArray[np.bool_]:
         """Whether the state counts as success at the end of an episode, ``(...)``."""
+        if self.plant.success is not None:
+            return np.asarray(self.plant.success(state))
+        within = [np.abs(state[..., c.index]) < c.band for c in self.plant.states if c.band is not None]
+        return np.asarray(np.logical_and.reduce(within))
 
-    @abstractmethod
     def sample_state(self, start: str) -> Array:
         """Draws an initial state ``(nx,)`` of the named distribution from ``self.np_random``."""
+        state = self.plant.starts[start](self.np_random)
+        if self.angle is not None and not -np.pi < state[self.angle] <= np.pi:
+            state[self.angle] = wrap_angle(state[self.angle])
+        return state
 
     @abstractmethod
     def draw(self, canvas: Canvas, moment: Moment) -> None:
@@ -287,6 +362,11 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
 
     def _info(self, state: Array, cost: float) -> dict[str, Any]:
         return {"cost": cost, "state": state.copy(), "is_success": bool(self.is_success(state))}
+
+
+def _entries(array: Array) -> list[Array]:
+    """The columns of ``array (..., n)``, each ``(..., 1)``."""
+    return [array[..., i : i + 1] for i in range(array.shape[-1])]
 
 
 def float32_box(low: list[float] | Array, high: list[float] | Array) -> spaces.Box:

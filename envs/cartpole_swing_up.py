@@ -3,27 +3,84 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from . import rendering as style
-from .arguments import Array, Start, checked_number
-from .base import SUCCESS_ANGLE, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from .base import ControlTask
+from .plant import Array, Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .registry import register
 from .rendering import Canvas, Moment, clockwise, refined, signed
-from .vector import ControlTaskVectorEnv
 
-GRAVITY = 9.8
-CART_MASS = 0.2
-POLE_MASS = 0.2
-HALF_LENGTH = 0.5
-FRICTION = 0.5
 MAX_FORCE = 2.0
-MAX_POSITION = 1e3
-MAX_CART_SPEED = 200.0
-MAX_POLE_SPEED = 500.0
+SUCCESS_ANGLE = 0.3  # rad from upright
+
+
+def dynamics(y: Entries, inputs: Entries, p: Values) -> Entries:
+    """The equations of motion, d[x, xd, phi, phid]/dt."""
+    _, xd, cos, sin, phid = y
+    (u,) = inputs
+    mass, moment = p["m_c"] + p["m_p"], p["m_p"] * p["l"]
+    friction, square = p["mu"] * xd, phid**2
+    drive = friction - u - moment * square * sin
+    if isinstance(cos, np.ndarray):  # on the unit circle
+        share = p["m_p"] * cos**2 / mass
+    else:
+        # Dividing by |(cos, sin)|^2 keeps the inertia positive off it, where the iterates of an NLP solver wander. The
+        # order of the product differs, and with it the rounding: data and fits made before would not repeat otherwise.
+        share = p["m_p"] / mass * cos**2 / (cos**2 + sin**2)
+    phidd = (p["g"] * sin + cos * drive / mass) / (p["l"] * (4.0 / 3.0 - share))
+    xdd = (u - friction + moment * (square * sin - phidd * cos)) / mass
+    return xd, xdd, phid, phidd
+
+
+def cost(s: Entries, inputs: Entries) -> object:
+    """The stage cost."""
+    x, xd, phi, phid = s
+    (u,) = inputs
+    return 2.0 * x**2 + phi**2 + 0.1 * xd**2 + 0.1 * phid**2 + 0.1 * u**2
+
+
+def max_friction(p: Values) -> float:
+    """The largest friction at which RK4 is stable, about 2.8 / dt, with a margin.
+
+    The mass that the force meets is least with the pole upright or hanging: m_c + m_p / 4.
+    """
+    return float(40.0 * (p["m_c"] + p["m_p"] / 4.0))
+
+
 # Starts from which no input leaves the observation bounds, and from which RK4 at this sampling time is stable.
-MAX_START = (100.0, 20.0, np.pi, 20.0)
-# RK4 is stable for the cart's friction up to about 2.8 / dt; here with a margin.
-MAX_FRICTION_RATE = 40.0
+PLANT = Plant(
+    id="mpcoffline/CartPoleSwingUp-v0",
+    name="cartpole",
+    dt=0.05,
+    states=(
+        State("x", "x", "m", limit=1e3, start=100.0, quantity="position"),
+        State("xd", "\\dot x", "m/s", limit=200.0, start=20.0, quantity="speed"),
+        State("phi", "\\varphi", "rad", quantity="angle", angle=True, band=SUCCESS_ANGLE),
+        State("phid", "\\dot\\varphi", "rad/s", limit=500.0, start=20.0, quantity="speed", span=(-12.0, 12.0)),
+    ),
+    inputs=(Input("u", "u", "N", -MAX_FORCE, MAX_FORCE, quantity="force"),),
+    parameters=(
+        Parameter("m_c", 0.2, 0.01, 100.0, "kg", spread=0.1),
+        Parameter("mu", 0.5, 0.0, max_friction, "N s/m", spread=0.25),
+        Parameter("m_p", 0.2, 0.01, 100.0, "kg", spread=0.1),
+        Parameter("l", 0.5, 0.05, 20.0, "m", spread=0.25),
+        Parameter("g", 9.8, 0.0, 30.0, "m/s^2"),
+    ),
+    dynamics=dynamics,
+    cost=cost,
+    starts={
+        "broad": Uniform((-1.0, -0.5, -np.pi, -1.0), (1.0, 0.5, np.pi, 1.0)),
+        "hanging": Uniform((-0.1, -0.1, np.pi - 0.2, -0.1), (0.1, 0.1, np.pi + 0.2, 0.1)),
+    },
+    nominal=Nominal((3.0, 0.01, 3.0, 1.0, 0.01), (0.001,), horizon=50),
+    shown=("phi", "x"),
+    plane=("phi", "phid"),
+    coverage=(("x", "xd"), ("phi", "phid"), ("phi", "u")),
+    catalog="mpcoffline.datasets.catalog",
+    mismatch=("mu", 0.0),
+    published=True,
+)
 
 
 class CartPoleSwingUpEnv(ControlTask):
@@ -100,9 +157,9 @@ class CartPoleSwingUpEnv(ControlTask):
     | Argument            | Type             | Default   | Meaning and range                                    |
     |---------------------|------------------|-----------|------------------------------------------------------|
     | `m_c`               | float            | 0.2       | mass of the cart, 0.01 to 100 kg                     |
+    | `mu`                | float            | 0.5       | friction of the cart, 0 to $40(m_c + m_p/4)$ N s/m   |
     | `m_p`               | float            | 0.2       | mass of the pole, 0.01 to 100 kg                     |
     | `l`                 | float            | 0.5       | half the length of the pole, 0.05 to 20 m            |
-    | `mu`                | float            | 0.5       | friction of the cart, 0 to $40(m_c + m_p/4)$ N s/m   |
     | `g`                 | float            | 9.8       | gravity, 0 to 30 m/s²                                |
     | `start`             | str, (low, high) | `"broad"` | starting states: a name, or bounds                   |
     | `process_noise`     | float, list      | 0.0       | std of noise $w$, one or one a state: $s_+ + w$      |
@@ -124,82 +181,9 @@ class CartPoleSwingUpEnv(ControlTask):
     Transactions on Systems, Man, and Cybernetics, 1983, for the equations.
     """
 
-    dt = 0.05
-    starts = ("broad", "hanging")
-    angle = 2
+    plant = PLANT
     picture_size = (600, 400)
-
-    def __init__(
-        self,
-        *,
-        m_c: float = CART_MASS,
-        m_p: float = POLE_MASS,
-        l: float = HALF_LENGTH,  # noqa: E741 -- the plant's own name
-        mu: float = FRICTION,
-        g: float = GRAVITY,
-        start: Start = "broad",
-        process_noise: ArrayLike = 0.0,
-        measurement_noise: ArrayLike = 0.0,
-        render_mode: str | None = None,
-    ) -> None:
-        self.m_c = checked_number("m_c", m_c, 0.01, 100.0, "kg")
-        self.m_p = checked_number("m_p", m_p, 0.01, 100.0, "kg")
-        self.l = checked_number("l", l, 0.05, 20.0, "m")
-        # The mass that the force meets is least with the pole upright or hanging: m_c + m_p / 4.
-        self.mu = checked_number("mu", mu, 0.0, MAX_FRICTION_RATE * (self.m_c + self.m_p / 4.0), "N s/m")
-        self.g = checked_number("g", g, 0.0, 30.0, "m/s^2")
-        self.action_space = float32_box([-MAX_FORCE], [MAX_FORCE])
-        bounds = np.array([MAX_POSITION, MAX_CART_SPEED, 1.0, 1.0, MAX_POLE_SPEED])
-        self.observation_space = float32_box(-bounds, bounds)
-        self.state_space = float64_box(list(MAX_START))
-        self.state_limit = np.array([MAX_POSITION, MAX_CART_SPEED, np.inf, MAX_POLE_SPEED])
-        super().__init__(
-            start=start, process_noise=process_noise, measurement_noise=measurement_noise, render_mode=render_mode
-        )
-
-    def derivative(self, state: Array, action: Array) -> Array:
-        """The equations of motion: d[x, xd, phi, phid]/dt, ``(..., 4)``."""
-        xd, phi, phid = state[..., 1], state[..., 2], state[..., 3]
-        u, sin, cos = action[..., 0], np.sin(phi), np.cos(phi)
-        mass, moment = self.m_c + self.m_p, self.m_p * self.l
-        drive = self.mu * xd - u - moment * np.square(phid) * sin
-        inertia = self.l * (4.0 / 3.0 - self.m_p * np.square(cos) / mass)
-        phidd = (self.g * sin + cos * drive / mass) / inertia
-        xdd = (u - self.mu * xd + moment * (np.square(phid) * sin - phidd * cos)) / mass
-        return np.stack([xd, xdd, phid, phidd], axis=-1)
-
-    def next_state(self, state: Array, action: Array) -> Array:
-        """The plant without noise: one RK4 step, then the angle wrapped."""
-        return self.confined(rk4(self.derivative, state, action, self.dt))
-
-    def cost(self, state: Array, action: Array) -> Array:
-        """The stage cost 2 x^2 + phi^2 + 0.1 xd^2 + 0.1 phid^2 + 0.1 u^2."""
-        x, xd, phi, phid = (state[..., i] for i in range(4))
-        return np.asarray(
-            2.0 * np.square(x)
-            + np.square(phi)
-            + 0.1 * np.square(xd)
-            + 0.1 * np.square(phid)
-            + 0.1 * np.square(action[..., 0])
-        )
-
-    def observe(self, state: Array) -> Observation:
-        """The observation [x, xd, cos phi, sin phi, phid]."""
-        x, xd, phi, phid = (state[..., i] for i in range(4))
-        return np.stack([x, xd, np.cos(phi), np.sin(phi), phid], axis=-1).astype(np.float32)
-
-    def is_success(self, state: Array) -> NDArray[np.bool_]:
-        """Whether the pole is within 0.3 rad of upright."""
-        return np.asarray(np.abs(state[..., 2]) < SUCCESS_ANGLE)
-
-    def sample_state(self, start: str) -> Array:
-        """Draws [x, xd, phi, phid]; see the class."""
-        rng = self.np_random
-        if start == "hanging":
-            state = rng.uniform([-0.1, -0.1, np.pi - 0.2, -0.1], [0.1, 0.1, np.pi + 0.2, 0.1])
-            state[2] = wrap_angle(state[2])
-            return state
-        return rng.uniform([-1.0, -0.5, -np.pi, -1.0], [1.0, 0.5, np.pi, 1.0])
+    l: float  # noqa: E741 -- the plant's own name
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
         """Draws cart and pole on the track, the way of the tip, the zone of success, the reference and the force."""
@@ -236,7 +220,4 @@ class CartPoleSwingUpEnv(ControlTask):
         canvas.caption(caption)
 
 
-class CartPoleSwingUpVectorEnv(ControlTaskVectorEnv):
-    """Many copies of :class:`CartPoleSwingUpEnv` stepped as arrays; see :class:`ControlTaskVectorEnv`."""
-
-    task_class = CartPoleSwingUpEnv
+CartPoleSwingUpVectorEnv = register(CartPoleSwingUpEnv)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from . import rendering as style
-from .arguments import Array, Start, checked_matrix, checked_number
-from .base import ControlTask, Observation, float32_box, float64_box
+from .arguments import checked_number
+from .base import ControlTask
+from .plant import Array, Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .registry import register
 from .rendering import Canvas, Moment, refined, signed
-from .vector import ControlTaskVectorEnv
 
 A0 = np.array([[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.9, 0.0], [0.0, 0.0, 0.0, 0.9]])
 B0 = np.array([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
@@ -35,6 +37,56 @@ MAX_FORCE = 10.0
 MAX_STATE = 1e4
 MAX_ALPHA = 4.0
 SUCCESS_RADIUS = 0.05
+
+
+def dynamics(s: Entries, inputs: Entries, p: Values) -> Entries:
+    """The next state, A s + B a.
+
+    Column by column: BLAS sums in an order that depends on the machine and on the number of vectors; this does not, so
+    that a recorded episode replays bit for bit, alone or among others.
+    """
+    A, B = p["A"], p["B"]
+    free = functools.reduce(operator.add, [A[:, j] * entry for j, entry in enumerate(s)])
+    return [free + functools.reduce(operator.add, [B[:, j] * entry for j, entry in enumerate(inputs)])]
+
+
+def cost(s: Entries, inputs: Entries) -> object:
+    """The stage cost s'Ws + a'Ra."""
+    x, y, xd, yd = s
+    force_x, force_y = inputs
+    return 9.0 * x**2 + 9.0 * y**2 + xd**2 + yd**2 + 0.1 * force_x**2 + 0.1 * force_y**2
+
+
+PLANT = Plant(
+    id="mpcoffline/LinearTracking-v0",
+    name="linear",
+    dt=0.1,
+    states=(
+        State("x", "x", "m", limit=MAX_STATE, band=SUCCESS_RADIUS, span=(-1.3, 1.3)),
+        State("y", "y", "m", limit=MAX_STATE, band=SUCCESS_RADIUS),
+        State("xd", "\\dot x", "m/s", limit=MAX_STATE, span=(-3.0, 3.0)),
+        State("yd", "\\dot y", "m/s", limit=MAX_STATE),
+    ),
+    inputs=(
+        Input("F_x", "F_x", "N", -MAX_FORCE, MAX_FORCE, quantity="force"),
+        Input("F_y", "F_y", "N", -MAX_FORCE, MAX_FORCE, quantity="force"),
+    ),
+    parameters=(Parameter("A", A0, spread=0.0), Parameter("B", B0, spread=0.0)),
+    discrete=True,
+    dynamics=dynamics,
+    cost=cost,
+    starts={"broad": Uniform([-1.0] * 4, [1.0] * 4)},
+    success=lambda s: np.hypot(s[..., 0], s[..., 1]) < SUCCESS_RADIUS,
+    nominal=Nominal(np.diag(STATE_WEIGHT).tolist(), np.diag(ACTION_WEIGHT).tolist(), horizon=100),
+    max_alpha=MAX_ALPHA,
+    shown=("x", "y"),
+    plane=("x", "xd"),
+    coverage=(("x", "y"), ("xd", "yd"), ("F_x", "F_y")),
+    seconds=5.0,
+    catalog="mpcoffline.datasets.catalog",
+    reference="riccati",
+    published=True,
+)
 
 
 class LinearTrackingEnv(ControlTask):
@@ -116,63 +168,28 @@ class LinearTrackingEnv(ControlTask):
     The paper gives no action bounds and no distribution of $s_0$: the ones here are ours.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
-    dt = 0.1
+    plant = PLANT
     trail_steps = 100
+    A: Array
+    B: Array
 
     def __init__(
-        self,
-        alpha: float = 1.0,
-        *,
-        A: ArrayLike | None = None,
-        B: ArrayLike | None = None,
-        start: Start = "broad",
-        process_noise: ArrayLike = 0.0,
-        measurement_noise: ArrayLike = 0.0,
-        render_mode: str | None = None,
+        self, alpha: float = 1.0, *, A: ArrayLike | None = None, B: ArrayLike | None = None, **arguments: Any
     ) -> None:
         self.alpha = checked_number("alpha", alpha, 0.0, MAX_ALPHA)
-        self.A, self.B = plant_matrices(self.alpha)
-        if A is not None:
-            self.A = checked_matrix("A", A, self.A.shape)
-        if B is not None:
-            self.B = checked_matrix("B", B, self.B.shape)
+        matrices = plant_matrices(self.alpha)
+        A, B = (own if given is None else given for own, given in zip(matrices, (A, B), strict=True))
+        super().__init__(A=A, B=B, **arguments)
+
+    def start_bound(self) -> Array:
+        """The largest b from which no admissible input leaves the observation bounds, for each coordinate."""
         bound = start_bound(self.A, self.B)
         if not bound >= 1.0:
             raise ValueError(
                 f"A, B: expected a plant that stays within {MAX_STATE:g} for 100 steps from |s| <= 1, "
                 f"got one that does so from |s| <= {bound:.3g} only."
             )
-        self.action_space = float32_box([-MAX_FORCE] * 2, [MAX_FORCE] * 2)
-        self.observation_space = float32_box([-MAX_STATE] * 4, [MAX_STATE] * 4)
-        self.state_space = float64_box([bound] * 4)
-        self.state_limit = np.full(4, MAX_STATE)
-        super().__init__(
-            start=start, process_noise=process_noise, measurement_noise=measurement_noise, render_mode=render_mode
-        )
-
-    def next_state(self, state: Array, action: Array) -> Array:
-        """The plant without noise: A s + B a."""
-        return self.confined(_product(self.A, state) + _product(self.B, action))
-
-    def cost(self, state: Array, action: Array) -> Array:
-        """The stage cost s'Ws + a'Ra."""
-        squares = np.concatenate(
-            [np.square(state) * np.diag(STATE_WEIGHT), np.square(action) * np.diag(ACTION_WEIGHT)], axis=-1
-        )
-        return np.asarray(sum(squares[..., i] for i in range(squares.shape[-1])))
-
-    def observe(self, state: Array) -> Observation:
-        """The state itself."""
-        return state.astype(np.float32)
-
-    def is_success(self, state: Array) -> NDArray[np.bool_]:
-        """Whether the mass is within 0.05 m of the origin."""
-        return np.asarray(np.hypot(state[..., 0], state[..., 1]) < SUCCESS_RADIUS)
-
-    def sample_state(self, start: str) -> Array:
-        """Uniform in [-1, 1]^4."""
-        return self.np_random.uniform(-1.0, 1.0, size=4)
+        return np.full(4, bound)
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
         """Draws the plane with the target, and the mass with its way, velocity and force."""
@@ -214,22 +231,9 @@ def start_bound(A: Array, B: Array, n_steps: int = 100) -> float:
     return bound
 
 
-class LinearTrackingVectorEnv(ControlTaskVectorEnv):
-    """Many copies of :class:`LinearTrackingEnv` stepped as arrays; see :class:`ControlTaskVectorEnv`."""
-
-    task_class = LinearTrackingEnv
-
-
 def plant_matrices(alpha: float) -> tuple[Array, Array]:
     """The matrices A ``(4, 4)`` and B ``(4, 2)`` of the plant; ``alpha = 0`` is the nominal model."""
     return A0 + alpha * DELTA_A, B0 + alpha * DELTA_B
 
 
-def _product(matrix: Array, vectors: Array) -> Array:
-    """``matrix`` times each of ``vectors (..., n)``, summed column by column.
-
-    BLAS sums in an order that depends on the machine and on the number of vectors; this does not, so that a recorded
-    episode replays bit for bit, alone or among others.
-    """
-    columns = (vectors[..., j, None] * matrix[:, j] for j in range(matrix.shape[1]))
-    return functools.reduce(np.add, columns)
+LinearTrackingVectorEnv = register(LinearTrackingEnv)

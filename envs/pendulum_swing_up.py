@@ -3,20 +3,60 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from . import rendering as style
-from .arguments import Array, Start, checked_number
-from .base import SUCCESS_ANGLE, ControlTask, Observation, float32_box, float64_box, rk4, wrap_angle
+from .base import ControlTask
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .registry import register
 from .rendering import Canvas, Moment, clockwise, refined, signed
-from .vector import ControlTaskVectorEnv
 
-GRAVITY = 9.8
-MASS = 1.0
-LENGTH = 1.0
 MAX_TORQUE = 2.0
-MAX_SPEED = 200.0
-MAX_START_SPEED = 90.0  # gravity and torque add at most 20.7 rad/s^2, 103.5 rad/s in the 5 s of an episode
+SUCCESS_ANGLE = 0.3  # rad from upright
+
+
+def dynamics(y: Entries, inputs: Entries, p: Values) -> Entries:
+    """The equation of motion, d[phi, phid]/dt."""
+    _, sin, phid = y
+    (u,) = inputs
+    return phid, 1.5 * p["g"] / p["l"] * sin + 3.0 / (p["m"] * p["l"] ** 2) * u
+
+
+def cost(s: Entries, inputs: Entries) -> object:
+    """The stage cost."""
+    phi, phid = s
+    (u,) = inputs
+    return phi**2 + 0.1 * phid**2 + 0.1 * u**2
+
+
+PLANT = Plant(
+    id="mpcoffline/PendulumSwingUp-v0",
+    name="pendulum",
+    dt=0.05,
+    states=(
+        State("phi", "\\varphi", "rad", quantity="angle", angle=True, band=SUCCESS_ANGLE),
+        # Gravity and torque add at most 20.7 rad/s^2, 103.5 rad/s in the 5 s of an episode.
+        State("phid", "\\dot\\varphi", "rad/s", limit=200.0, start=90.0, quantity="speed", span=(-9.0, 9.0)),
+    ),
+    inputs=(Input("u", "u", "N m", -MAX_TORQUE, MAX_TORQUE, quantity="torque"),),
+    parameters=(
+        Parameter("m", 1.0, 0.01, 100.0, "kg", spread=0.5),
+        Parameter("l", 1.0, 0.05, 20.0, "m", spread=0.5),
+        Parameter("g", 9.8, 0.0, 30.0, "m/s^2"),
+    ),
+    dynamics=dynamics,
+    cost=cost,
+    starts={
+        "broad": Uniform((-np.pi, -1.0), (np.pi, 1.0)),
+        "hanging": Uniform((-0.2, -0.1), (0.2, 0.1), around=(np.pi, 0.0)),
+    },
+    nominal=Nominal((1.0, 1.0, 0.1), (0.1,), horizon=50),
+    shown=("phi", "phid"),
+    plane=("phi", "phid"),
+    coverage=(("phi", "phid"), ("phi", "u")),
+    catalog="mpcoffline.datasets.catalog",
+    mismatch=("l", 1.3),  # gravity and input share it
+    published=True,
+)
 
 
 class PendulumSwingUpEnv(ControlTask):
@@ -107,60 +147,7 @@ class PendulumSwingUpEnv(ControlTask):
     The plant is that of Gymnasium's `Pendulum` with other constants and a Runge-Kutta step.
     """
 
-    dt = 0.05
-    starts = ("broad", "hanging")
-    angle = 0
-
-    def __init__(
-        self,
-        *,
-        m: float = MASS,
-        l: float = LENGTH,  # noqa: E741 -- the plant's own name
-        g: float = GRAVITY,
-        start: Start = "broad",
-        process_noise: ArrayLike = 0.0,
-        measurement_noise: ArrayLike = 0.0,
-        render_mode: str | None = None,
-    ) -> None:
-        self.m = checked_number("m", m, 0.01, 100.0, "kg")
-        self.l = checked_number("l", l, 0.05, 20.0, "m")
-        self.g = checked_number("g", g, 0.0, 30.0, "m/s^2")
-        self.action_space = float32_box([-MAX_TORQUE], [MAX_TORQUE])
-        self.observation_space = float32_box([-1.0, -1.0, -MAX_SPEED], [1.0, 1.0, MAX_SPEED])
-        self.state_space = float64_box([np.pi, MAX_START_SPEED])
-        self.state_limit = np.array([np.inf, MAX_SPEED])
-        super().__init__(
-            start=start, process_noise=process_noise, measurement_noise=measurement_noise, render_mode=render_mode
-        )
-
-    def derivative(self, state: Array, action: Array) -> Array:
-        """The equation of motion: d[phi, phid]/dt, ``(..., 2)``."""
-        acceleration = 1.5 * self.g / self.l * np.sin(state[..., 0]) + 3.0 / (self.m * self.l**2) * action[..., 0]
-        return np.stack([state[..., 1], acceleration], axis=-1)
-
-    def next_state(self, state: Array, action: Array) -> Array:
-        """The plant without noise: one RK4 step, then the angle wrapped."""
-        return self.confined(rk4(self.derivative, state, action, self.dt))
-
-    def cost(self, state: Array, action: Array) -> Array:
-        """The stage cost phi^2 + 0.1 phid^2 + 0.1 u^2."""
-        return np.asarray(np.square(state[..., 0]) + 0.1 * np.square(state[..., 1]) + 0.1 * np.square(action[..., 0]))
-
-    def observe(self, state: Array) -> Observation:
-        """The observation [cos phi, sin phi, phid]."""
-        phi, phid = state[..., 0], state[..., 1]
-        return np.stack([np.cos(phi), np.sin(phi), phid], axis=-1).astype(np.float32)
-
-    def is_success(self, state: Array) -> NDArray[np.bool_]:
-        """Whether the rod is within 0.3 rad of upright."""
-        return np.asarray(np.abs(state[..., 0]) < SUCCESS_ANGLE)
-
-    def sample_state(self, start: str) -> Array:
-        """Draws [phi, phid]; see the class."""
-        if start == "hanging":
-            angle = wrap_angle(np.pi + self.np_random.uniform(-0.2, 0.2, size=1))[0]
-            return np.array([angle, self.np_random.uniform(-0.1, 0.1)])
-        return self.np_random.uniform([-np.pi, -1.0], [np.pi, 1.0])
+    plant = PLANT
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
         """Draws the rod, the way of its tip, the zone of success around upright and the torque."""
@@ -182,7 +169,4 @@ class PendulumSwingUpEnv(ControlTask):
         canvas.caption(caption)
 
 
-class PendulumSwingUpVectorEnv(ControlTaskVectorEnv):
-    """Many copies of :class:`PendulumSwingUpEnv` stepped as arrays; see :class:`ControlTaskVectorEnv`."""
-
-    task_class = PendulumSwingUpEnv
+PendulumSwingUpVectorEnv = register(PendulumSwingUpEnv)

@@ -15,4 +15,3 @@ import mpcoffline.envs  # noqa: F401 -- registers the environments
 __version__ = "0.1.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__all__ = [*__all__, "__version__"]

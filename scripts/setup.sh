@@ -4,6 +4,20 @@
 say() { printf '\n==> %s\n' "$*"; }
 refuse() { printf '%s: %s\n' "$(basename "$0")" "$*" >&2; exit 2; }
 
+# beside COMMAND...: runs it in the background; ended: waits for it, says what it said, and fails as it did.
+beside() {
+    beside_said="$(mktemp)"
+    "$@" >"$beside_said" 2>&1 &
+    beside_id=$!
+}
+ended() {
+    local code=0
+    wait "$beside_id" || code=$?
+    cat "$beside_said"
+    rm -f "$beside_said"
+    return "$code"
+}
+
 # A command that runs a Python of at least 3.11; $PYTHON is asked first.
 find_python() {
     local candidate
@@ -48,8 +62,9 @@ prepare_venv() {
     # torch first and pinned: left to itself, pip may choose a build with gigabytes of GPU libraries.
     pin="$(grep '^torch==' constraints.txt)"
     say "Installing $pin into .venv"
-    .venv/bin/python -m pip install --disable-pip-version-check -q "$pin" -c constraints.txt
+    # Modules are compiled when they are first imported: of most packages, few ever are.
+    .venv/bin/python -m pip install --disable-pip-version-check -q --no-compile "$pin" -c constraints.txt
     say "Installing the project (editable) and what it needs into .venv"
-    .venv/bin/python -m pip install --disable-pip-version-check -q -c constraints.txt -e "$target"
+    .venv/bin/python -m pip install --disable-pip-version-check -q --no-compile -c constraints.txt -e "$target"
     printf '%s\n' "$fingerprint" >".venv/.installed-$extra"
 }

@@ -80,13 +80,13 @@ def solve() -> None:
         assert_type(solution.value, Array)
         again = solver.solve([[1.0, 0.0], [0.5, -0.2]], warm_start=solution.plan.shifted())
         if not (solution.success.all() and again.success.all()):
-            raise SystemExit(f"{solver.name}: {solution.status}")
+            raise SystemExit(f"{solver.name}: {solution.words}")
         values: Array = solver.q_value([1.0, 0.0], [0.3])
         print(solver.name, solution.u0.ravel(), values)
     slow = [StateBounds([-np.inf, -0.5], [np.inf, 0.5], soft=Penalty(l1=10.0))]
     gentle = Constraint(lambda x, u, p: u - 1.0, name="force")
     for constraints in (slow, [gentle]):
-        print(make_solver(sledge(constraints=constraints)).solve([1.0, 0.0]).status)
+        print(make_solver(sledge(constraints=constraints)).solve([1.0, 0.0]).words)
 
 
 def learn() -> None:

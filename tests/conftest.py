@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 import rich
@@ -15,6 +16,16 @@ settings.load_profile("suite")
 
 # No test asks a remote that the user has configured.
 os.environ.pop("MINARI_REMOTE", None)
+
+
+@pytest.fixture
+def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A store that tests share which only read shipped data sets: each is unpacked once, by whoever comes first."""
+    base = tmp_path_factory.getbasetemp()
+    store = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shipped"
+    store.mkdir(exist_ok=True)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(store))
+    return store
 
 
 @pytest.fixture(autouse=True)

@@ -29,10 +29,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.parametrize("data", ["log", "first 1000", "noise 5 %"])
-def test_cases_share_v_where_their_rows_are_the_same(
-    bench: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, data: str
-) -> None:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+@pytest.mark.usefixtures("shipped")
+def test_cases_share_v_where_their_rows_are_the_same(bench: Any, monkeypatch: pytest.MonkeyPatch, data: str) -> None:
     monkeypatch.setattr(bench, "fit_value", lambda *arguments, **options: object())
     first, second = (bench.Case("pendulum", 1.0, data, bench.QUADRATIC, seed) for seed in (0, 1))
     tables = [bench.log_of(case) for case in (first, second)]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mpcoffline.learner.learner import PRESETS, LearnerConfig
-from mpcoffline.learning import FitConfig, ValueConfig
+from mpcoffline.learner.presets import PRESETS
+from mpcoffline.learning import Paper, ParameterConfig, ValueConfig
 
 TEXT = (Path(__file__).parents[1] / "docs" / "using_with_sb3.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL)
@@ -24,7 +24,7 @@ def test_the_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.chdir(tmp_path)
     # Whether learning succeeds is tested elsewhere; here it is brief.
-    brief = LearnerConfig(horizon=15, value=ValueConfig(n_steps=20), fit=FitConfig(n_steps=2, refit_rows=2000))
+    brief = Paper(horizon=15, value=ValueConfig(n_steps=20), fit=ParameterConfig(n_steps=2, refit_rows=2000))
     monkeypatch.setitem(PRESETS, "paper", brief)
     names: dict[str, object] = {"__name__": "__main__"}
     for block in BLOCKS:

@@ -14,7 +14,7 @@ from mpcoffline.core.checks import check_known, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.datasets import load_dataset
 from mpcoffline.gallery import collect
-from mpcoffline.learner.presets import LearnerConfig
+from mpcoffline.learning import StartConfig, TerminalConfig
 from mpcoffline.learning.terminal import TERMINAL_KINDS
 from mpcoffline.studies.setups import setup_of
 
@@ -24,8 +24,8 @@ LOOKUPS: dict[str, Callable[[Any], Any]] = {
     "MPCPolicy": lambda name: MPCPolicy(MPC, solver=name),
     "preset": lambda name: OfflineMPCLearner(MPC, preset=name),
     "value": lambda name: OfflineMPCLearner(MPC, value=name if name is not None else 3),
-    "terminal": lambda name: LearnerConfig(terminal=name),
-    "init": lambda name: LearnerConfig(init=name),
+    "terminal": lambda name: TerminalConfig(method=name),
+    "init": lambda name: StartConfig(init=name),
     "nominal_mpc": nominal_mpc,
     "collect": lambda name: collect(name, progress=False),
     "setup_of": lambda name: setup_of(name, 1.0, 0),

@@ -3,8 +3,8 @@
 .venv/bin/python docs/figures/make_diagrams.py            # writes them
 .venv/bin/python docs/figures/make_diagrams.py --check    # says whether they are up to date
 
-The arrows of ``architecture`` are the imports of the package, read by grimp. A module without a box, an arrow that does
-not point down, or a box above one that the contract in pyproject.toml puts higher is an error, not a drawing.
+The rows of ``architecture`` are those of the contract in pyproject.toml, compared with the imports of the package as
+grimp reads them: a room without a text, or an import that does not point down, is an error, not a drawing.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import argparse
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from html import escape
-from itertools import pairwise
 from pathlib import Path
 
 import grimp
@@ -24,7 +23,6 @@ import grimp
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 
-Arrows = set[tuple[str, str]]
 Point = tuple[float, float]
 
 
@@ -73,10 +71,6 @@ class Box:
         """Its horizontal middle."""
         return self.x + self.width / 2
 
-    def holds(self, point: Point) -> bool:
-        """Whether a point lies inside."""
-        return self.x < point[0] < self.x + self.width and self.y < point[1] < self.y + self.height
-
     def svg(self, theme: Theme) -> str:
         """The box with its text, the title bold and the rest small."""
         fill, edge = theme.kinds[self.kind]
@@ -108,7 +102,7 @@ def label(text: str, place: Point, color: str, size: float, *, bold: bool = Fals
     )
 
 
-def arrow(points: Iterable[Point], color: str, *, dashed: bool = False) -> str:
+def arrow(points: Iterable[Point], color: str) -> str:
     """Straight pieces from point to point with rounded corners, a head at the last."""
     corners = list(points)
     path = f"M{corners[0][0]:g},{corners[0][1]:g}"
@@ -116,8 +110,7 @@ def arrow(points: Iterable[Point], color: str, *, dashed: bool = False) -> str:
         start, end = towards(here, before, 7), towards(here, after, 7)
         path += f" L{start[0]:g},{start[1]:g} Q{here[0]:g},{here[1]:g} {end[0]:g},{end[1]:g}"
     path += f" L{corners[-1][0]:g},{corners[-1][1]:g}"
-    dashes = ' stroke-dasharray="5 4"' if dashed else ""
-    return f'<path d="{path}" fill="none" stroke="{color}" stroke-width="1.5"{dashes} marker-end="url(#head)"/>'
+    return f'<path d="{path}" fill="none" stroke="{color}" stroke-width="1.5" marker-end="url(#head)"/>'
 
 
 def towards(start: Point, end: Point, most: float) -> Point:
@@ -178,175 +171,66 @@ def data_flow(theme: Theme) -> str:
 
 # --- The architecture ------------------------------------------------------------------------------------------------
 
-#: The modules of each box; every module of the package is in one.
-MODULES = {
-    "cli": ("__main__", "cli", "cli_common", "cli_datasets", "cli_figures", "cli_learn", "cli_run", "cli_tools"),
-    "doctor": ("doctor",),
-    "export": ("export",),
-    "sb3": ("sb3",),
-    "diagnostics": ("diagnostics",),
-    "study": ("study",),
-    "learner": ("learner", "fitting", "checkpoint", "presets", "loggers"),
-    "plotting": ("plotting",),
-    "evaluation": ("evaluation",),
-    "policy": ("policy", "predictors"),
-    "solvers": ("solvers",),
-    "learning": ("learning",),
-    "tasks": ("tasks",),
-    "mpc": ("mpc",),
-    "datasets": ("datasets",),
-    "base": ("errors", "core", "checks", "archive", "parallel"),
-    "envs": ("envs",),
+#: What each room is for, and its colour; which rooms there are, and in which order, is read from the contract.
+ROOMS = {
+    "cli": ("the program mpcoffline", "use"),
+    "studies": ("the paper's experiments", "use"),
+    "gallery": ("recipes, agents, data cards", "data"),
+    "diagnostics": ("may I trust it?", "learn"),
+    "simulation": ("models of the log, closed loops on them", "learn"),
+    "sb3": ("where SB3 expects an algorithm", "control"),
+    "plotting": ("figures, films", "use"),
+    "learner": ("a method, its options, checkpoints, the policy", "learn"),
+    "control": ("policy, evaluation, export as C", "control"),
+    "solvers": ("how it is optimised: lqr, ddp, ipopt", "control"),
+    "learning": ("from data to θ: stages and methods", "learn"),
+    "estimation": ("identification, noise, smoothing", "learn"),
+    "plants": ("MPC_1 of each plant", "control"),
+    "datasets": ("record, store, read, share", "data"),
+    "mpc": ("what is optimised: θ, model, costs, constraints", "control"),
+    "core": ("errors, checks, limits, files, registries", "use"),
+    "envs": ("the plants, as Gymnasium environments", "data"),
 }
-_ROWS = (20.0, 118.0, 216.0, 314.0, 412.0, 510.0, 608.0)
-_HIGH = 62.0
-
-
-def _box(row: int, x: float, width: float, title: str, line: str, kind: str) -> Box:
-    return Box(x, _ROWS[row], width, _HIGH, title, tuple(line.split("\n")), kind)
-
-
-BOXES = {
-    "cli": _box(0, 20, 940, "cli", "the program mpcoffline, in seven modules", "use"),
-    "doctor": _box(1, 20, 94, "doctor", "installation", "use"),
-    "export": _box(1, 124, 94, "export", "C99", "control"),
-    "sb3": _box(1, 236, 150, "sb3", "an SB3 algorithm", "control"),
-    "diagnostics": _box(1, 416, 180, "diagnostics", "may I trust it?", "learn"),
-    "study": _box(1, 626, 334, "study", "the paper's experiments", "use"),
-    "learner": _box(2, 376, 230, "learner", "fitting, presets,\ncheckpoint, loggers", "learn"),
-    "plotting": _box(2, 630, 130, "plotting", "figures, films", "use"),
-    "evaluation": _box(2, 830, 130, "evaluation", "closed loops", "control"),
-    "policy": _box(3, 166, 190, "policy, predictors", "an MPC as an SB3 policy", "control"),
-    "solvers": _box(4, 166, 190, "solvers", "how it is optimised", "control"),
-    "learning": _box(4, 426, 180, "learning", "from data to θ", "learn"),
-    "tasks": _box(4, 720, 150, "tasks", "MPC_1 of each task", "control"),
-    "mpc": _box(5, 166, 190, "mpc", "what is optimised", "control"),
-    "datasets": _box(5, 426, 180, "datasets", "record, store, read", "data"),
-    "base": _box(
-        6,
-        20,
-        586,
-        "errors, core, checks, archive, parallel",
-        "imported by every box but envs: no arrows are drawn",
-        "use",
-    ),
-    "envs": _box(6, 630, 330, "envs", "the plants, as Gymnasium environments", "data"),
-}
-#: Where an arrow leaves its box, where it enters the other, and how far above that box it runs across.
-ROUTES: dict[tuple[str, str], tuple[float, float, float]] = {
-    ("cli", "doctor"): (67, 67, 18), ("cli", "export"): (171, 171, 18), ("cli", "diagnostics"): (506, 506, 18),
-    ("cli", "study"): (793, 793, 18), ("export", "learner"): (171, 400, 11), ("sb3", "learner"): (311, 420, 18),
-    ("diagnostics", "learner"): (491, 491, 18), ("diagnostics", "plotting"): (560, 665, 18),
-    ("study", "learner"): (650, 560, 11), ("study", "plotting"): (715, 715, 18), ("study", "tasks"): (795, 795, 18),
-    ("study", "evaluation"): (895, 895, 18), ("learner", "policy"): (420, 310, 18),
-    ("learner", "learning"): (516, 516, 18), ("policy", "solvers"): (261, 261, 18),
-    ("doctor", "solvers"): (67, 210, 18), ("doctor", "datasets"): (67, 450, 10), ("solvers", "mpc"): (261, 261, 18),
-    ("learning", "mpc"): (470, 316, 23), ("learning", "datasets"): (540, 540, 18),
-    ("plotting", "mpc"): (665, 316, 23), ("tasks", "mpc"): (750, 316, 23), ("tasks", "envs"): (795, 795, 18),
-    ("plotting", "envs"): (695, 695, 18), ("evaluation", "datasets"): (915, 590, 10),
-    ("evaluation", "solvers"): (860, 330, 10), ("datasets", "envs"): (570, 670, 18),
-}  # fmt: skip
+_LEFT, _WIDTH, _HIGH, _GAP = 20.0, 940.0, 52.0, 16.0
 
 
 def architecture(theme: Theme) -> str:
-    """The boxes, the imports between them, and the import that must not be."""
-    drawn = checked_arrows()
-    gap = [(BOXES["learning"].x, 443.0), (BOXES["solvers"].x + BOXES["solvers"].width, 443.0)]
-    cross = "M385,437 l12,12 m0,-12 l-12,12"
+    """The rooms in the rows of the contract: each may import those of the rows below it, and no other."""
+    rows, parts = checked_rows(), []
+    for i, row in enumerate(rows):
+        width = (_WIDTH - _GAP * (len(row) - 1)) / len(row)
+        for j, room in enumerate(row):
+            line, kind = ROOMS[room]
+            box = Box(_LEFT + j * (width + _GAP), 20 + i * (_HIGH + _GAP), width, _HIGH, room, (line,), kind)
+            parts.append(box.svg(theme))
+    height = 20 + len(rows) * (_HIGH + _GAP)
+    line = [(_LEFT + _WIDTH + 22, 24.0), (_LEFT + _WIDTH + 22, height - _GAP - 4)]
+    turned = f'<g transform="rotate(90 {line[0][0] + 14:g} {height / 2:g})">'
+    words = label("imports", (line[0][0] + 14, height / 2 + 4), theme.faint, 12.5)
     return page(
-        980, 690, "The packages of mpcoffline and what they import",
-        [
-            *(arrow(way(*pair), theme.line) for pair in sorted(drawn)),
-            arrow(gap, theme.refused, dashed=True).replace("url(#head)", "none"),
-            f'<path d="{cross}" stroke="{theme.refused}" stroke-width="2.4" fill="none"/>',
-            label("never", (391, 429), theme.refused, 11.5, bold=True),
-            *(box.svg(theme) for box in BOXES.values()),
-        ],
-        theme,
+        1010, height + 4, "The rooms of mpcoffline, each above those that it may import",
+        [arrow(line, theme.line), f"{turned}{words}</g>", *parts], theme,
     )  # fmt: skip
 
 
-def way(source: str, target: str) -> list[Point]:
-    """The corners of an arrow: down, across above the target, down."""
-    leaves, enters, above = ROUTES[source, target]
-    start, end = (leaves, BOXES[source].y + _HIGH), (enters, BOXES[target].y)
-    return [start, end] if leaves == enters else [start, (leaves, end[1] - above), (enters, end[1] - above), end]
-
-
-def imports() -> Arrows:
-    """Which box imports which, at run time; imports for type checking alone do not count."""
-    graph = grimp.build_graph("mpcoffline", exclude_type_checking_imports=True, cache_dir=None)
-    modules = {name for name in graph.modules if "." in name}  # without mpcoffline/__init__.py
-    home = {module: box for box, members in MODULES.items() for module in members}
-    found = {_top(name) for name in modules}
-    if found != set(home):
-        raise SystemExit(f"modules without a box: {sorted(found - set(home))}; gone: {sorted(set(home) - found)}")
-    pairs = ((a, b) for a in modules for b in graph.find_modules_directly_imported_by(a) if b in modules)
-    boxes = ((home[_top(a)], home[_top(b)]) for a, b in pairs)
-    return {(a, b) for a, b in boxes if a != b}
-
-
-def _top(name: str) -> str:
-    """The name below ``mpcoffline``."""
-    return name.split(".")[1]
-
-
-def checked_arrows() -> Arrows:
-    """The arrows to draw: imports that do not follow from others. Refuses what the drawing would get wrong."""
-    every = imports()
-    users = {source for source, target in every if target == "base"}
-    if users != set(MODULES) - {"base", "envs"}:
-        raise SystemExit(f"the text in 'base' is wrong: it is imported by {sorted(users)}")
-    every = {pair for pair in every if "base" not in pair}
-    arrows = {(a, b) for a, b in every if not any(b in reached(c, every) for x, c in every if x == a and c != b)}
-    if arrows != set(ROUTES):
-        raise SystemExit(
-            f"arrows without a route: {sorted(arrows - set(ROUTES))}; gone: {sorted(set(ROUTES) - arrows)}"
-        )
-    for pair in arrows:
-        if BOXES[pair[0]].y >= BOXES[pair[1]].y:
-            raise SystemExit(f"the arrow {pair} does not point down")
-        for name, box in BOXES.items():
-            if name not in pair and any(box.holds(point) for point in along(way(*pair))):
-                raise SystemExit(f"the arrow {pair} runs through {name}")
-    check_contract()
-    return arrows
-
-
-def check_contract() -> None:
-    """The boxes stand as the layers of import-linter's contract, and learning may not import solvers."""
+def checked_rows() -> list[list[str]]:
+    """The rows of the contract; refuses rooms without a text, texts without a room, and imports that go up."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
-    layers = next(c["layers"] for c in contracts if c["type"] == "layers")
-    home = {module: box for box, modules in MODULES.items() for module in modules}
-    names = [[name.removeprefix("mpcoffline.") for name in re.findall(r"[\w.]+", layer)] for layer in layers]
-    rows = [[BOXES[home[name]].y for name in layer] for layer in names]
-    for i, (above, below) in enumerate(pairwise(rows)):
-        if max(below) < min(above):
-            raise SystemExit(f"the boxes of {layers[i + 1]!r} stand above those of {layers[i]!r}")
-    if not any(
-        "mpcoffline.learning" in c.get("source_modules", ()) and "mpcoffline.solvers" in c["forbidden_modules"]
-        for c in contracts
-        if c["type"] == "forbidden"
-    ):
-        raise SystemExit("no contract forbids that learning imports solvers")
-
-
-def reached(start: str, arrows: Arrows) -> set[str]:
-    """All that can be reached from a box."""
-    seen: set[str] = set()
-    waiting = [start]
-    while waiting:
-        here = waiting.pop()
-        following = {b for a, b in arrows if a == here} - seen
-        seen |= following
-        waiting += following
-    return seen
-
-
-def along(corners: list[Point]) -> Iterator[Point]:
-    """Points on the way from corner to corner."""
-    for (x0, y0), (x1, y1) in pairwise(corners):
-        yield from ((x0 + k / 100 * (x1 - x0), y0 + k / 100 * (y1 - y0)) for k in range(101))
+    layers = next(c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == ["mpcoffline"])
+    rows = [[room for room in re.findall(r"\w+", layer) if room != "__main__"] for layer in layers]
+    rows = [row for row in rows if row]
+    graph = grimp.build_graph("mpcoffline", exclude_type_checking_imports=True, cache_dir=None)
+    found = {name.split(".")[1] for name in graph.modules if "." in name} - {"__main__"}
+    listed = [room for row in rows for room in row]
+    if not found == set(listed) == set(ROOMS):
+        raise SystemExit(f"rooms {sorted(found)}, in the contract {sorted(listed)}, with a text {sorted(ROOMS)}")
+    place = {room: i for i, row in enumerate(rows) for room in row}
+    for module in graph.modules - {"mpcoffline", "mpcoffline.__main__"}:
+        for other in graph.find_modules_directly_imported_by(module) - {"mpcoffline"}:
+            above, below = module.split(".")[1], other.split(".")[1]
+            if above != below and place[above] >= place[below]:
+                raise SystemExit(f"{module} imports {other}: that does not point down")
+    return rows
 
 
 DIAGRAMS: dict[str, Callable[[Theme], str]] = {"data_flow": data_flow, "architecture": architecture}

@@ -22,9 +22,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mpcoffline import MPC, OfflineMPCLearner, TransitionTable, make_solver, nominal_mpc
-from mpcoffline.learning.bellman.equation import BellmanFit
+from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, new_figure, paper_style
-from mpcoffline.plotting.panels import on_plane, task_of
+from mpcoffline.plotting.panels import on_plane, plane_of, task_of
 
 Array = NDArray[np.float64]
 
@@ -57,11 +57,11 @@ def themed(theme: str) -> Iterator[None]:
 
 def log_and_value(table: TransitionTable, learner: OfflineMPCLearner) -> Figure:
     """What is in the log, and what (VALUE) makes of it: costs of single steps, and V."""
-    task, labels = task_of(PENDULUM)
+    task, plant = task_of(PENDULUM)
     y, cost = table.observations.astype(np.float64), table.costs.astype(np.float64)
     angle, speed = np.mod(np.arctan2(y[:, 1], y[:, 0]), 2 * np.pi), y[:, 2]
     assert learner.value_function is not None
-    horizontal, vertical, value = on_plane(task, labels, learner.value_function.predict, 241)
+    horizontal, vertical, value = on_plane(task, plane_of(plant), learner.value_function.predict, 241)
     figure = new_figure(PAGE_WIDTH, 2.75)
     left, right = figure.subplots(1, 2, sharey=True)
     dots = left.scatter(angle, speed, 3.0, np.maximum(cost, 0.02), cmap="cividis", norm=LogNorm(0.02, 20.0), lw=0)
@@ -118,17 +118,11 @@ def diagonal(axes: Axes, end: float) -> None:
 def regression(mpc: MPC, learner: OfflineMPCLearner, table: TransitionTable) -> tuple[Array, Array]:
     """Of (FIT): what the stage cost is asked to be, and what it is, each ``(n,)``."""
     assert learner.value_function is not None
-    problem = BellmanFit(mpc.replace(discount=learner.mpc.discount), learner.value_function, 1.0)
+    problem = BellmanProblem(mpc.replace(discount=learner.mpc.discount), learner.value_function, 1.0)
     columns, theta = table.columns(torch.from_numpy(np.array(table.rows))), torch.from_numpy(mpc.theta)
     with torch.no_grad():
         asked = problem.target(columns) - problem.predicted_value(columns, theta)
         return asked.numpy(), problem.stage_cost(columns, theta).numpy()
-
-
-def some(table: TransitionTable) -> TransitionTable:
-    """A few transitions at random."""
-    rows = np.sort(np.random.default_rng(0).permutation(len(table))[:SHOWN])
-    return TransitionTable(table.rows[rows], table.ny, table.nu, table.episode_ids[rows])
 
 
 def main() -> None:
@@ -144,7 +138,7 @@ def main() -> None:
         learner = OfflineMPCLearner.load(saved)
     for name, mpc in (("theta_0", learner.nominal_mpc), ("theta", learner.mpc)):
         print(name, {key: np.round(array, 3).tolist() for key, array in mpc.values.items()})
-    seen, learned_from = some(table), some(table.trim(learner.config.trim))
+    seen, learned_from = table.sample(SHOWN, 0), table.trim(learner.method.trim).sample(SHOWN, 0)
     for theme, (*_, before, after) in COLORS.items():
         with themed(theme):
             for name, figure in (

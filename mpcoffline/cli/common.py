@@ -25,6 +25,7 @@ from typer.core import TyperGroup
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError, visible
 from mpcoffline.core.outputs import check_output
+from mpcoffline.envs import PLANTS, ControlTask
 
 from .others import AddedCommand, added_commands
 
@@ -51,22 +52,7 @@ console = SafeConsole()
 messages = SafeConsole(stderr=True, soft_wrap=True, highlight=False)
 
 
-class Task(StrEnum):
-    """The tasks with a nominal controller."""
-
-    linear = "linear"
-    pendulum = "pendulum"
-    cartpole = "cartpole"
-
-
-class ValueForm(StrEnum):
-    """The methods of (VALUE), ``mpcoffline.learning.VALUE_METHODS``."""
-
-    residual = "residual"
-    td = "td"
-    expectile = "expectile"
-    iql = "iql"
-    auto = "auto"
+Task = StrEnum("Task", {plant.name: plant.name for plant in PLANTS.values()})  # type: ignore[misc]
 
 
 class Preset(StrEnum):
@@ -85,6 +71,31 @@ class Start(StrEnum):
     hanging = "hanging"
 
 
+def _checked_value(given: str | None) -> str | None:
+    """Refuses what is no method of (VALUE); torch is imported where there is one to look at."""
+    if given is not None:
+        from mpcoffline.core.checks import check_known
+
+        check_known("--value", given, _value_methods())
+    return given
+
+
+def _value_methods() -> list[str]:
+    from mpcoffline.learning import VALUE_METHODS
+
+    return ["auto", *VALUE_METHODS]
+
+
+Value = Annotated[
+    str | None,
+    typer.Option(
+        help="Method of (VALUE), e.g. residual, the published one, or auto.",
+        metavar="METHOD",
+        show_default="the preset's",
+        callback=_checked_value,
+        autocompletion=_value_methods,
+    ),
+]
 TaskArgument = Annotated[Task, typer.Argument(help="Which task.", show_default=False)]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 Alpha = Annotated[
@@ -199,12 +210,10 @@ def made_environment(env_id: str, alpha: float | None, start: Start | None) -> E
     """The environment; options that it does not know are refused before anything is solved."""
     import gymnasium as gym
 
-    from mpcoffline.envs import ENV_IDS, ControlTask
-
     try:
         env: Env[Any, Any] = gym.make(env_id) if alpha is None else gym.make(env_id, alpha=alpha)
     except gym.error.UnregisteredEnv as error:
-        nearest = difflib.get_close_matches(env_id, ENV_IDS, n=1, cutoff=0.3)
+        nearest = difflib.get_close_matches(env_id, [plant.id for plant in PLANTS.values()], n=1, cutoff=0.3)
         hint = f"Did you mean {nearest[0]!r}?" if nearest else ""
         raise UnknownIdError("--env", expected="a registered environment", actual=repr(env_id), hint=hint) from error
     except TypeError as error:

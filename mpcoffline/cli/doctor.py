@@ -134,21 +134,25 @@ def _cache() -> Iterator[Check]:
 
 
 def _solvers() -> Iterator[Check]:
-    """Each solver solves a tiny problem; the compiled one is the only one that may be missing."""
+    """Each solver solves a tiny problem; one that needs a compiler may be missing."""
     import numpy as np
 
-    from mpcoffline import MPC, Model, QuadraticCost, make_solver
+    from mpcoffline import MPC, Model, QuadraticCost
+    from mpcoffline.solvers import SOLVERS
 
     model = Model(lambda x, u, p: x + p["b"] * u, nx=1, nu=1, dt=1.0, parameters={"b": 1.0}, discrete=True)
     # min x^2 + u^2 + (x + u)^2 from x = 1: u = -1/2.
     tiny = MPC(model, QuadraticCost([[1.0]], [[1.0]]), QuadraticCost([[1.0]]), 1, 1.0, [-1.0], [1.0])
-    for name in ("lqr", "ddp", "ipopt"):
+    for name, kind in SOLVERS.items():
+        if kind.refuses(tiny):
+            continue
         begin = time.perf_counter()
         try:
-            action = float(np.asarray(make_solver(tiny, name).solve(np.array([1.0])).u0)[0])
+            action = float(np.asarray(kind(tiny).solve(np.array([1.0])).u0)[0])
         except Exception as error:
-            status: Status = "warn" if name == "ddp" else "fail"
-            yield Check(f"solver {name}", status, str(error), "See C compiler above." if name == "ddp" else _REINSTALL)
+            status: Status = "warn" if kind.needs_compiler else "fail"
+            advice = "See C compiler above." if kind.needs_compiler else _REINSTALL
+            yield Check(f"solver {name}", status, str(error), advice)
             continue
         right = abs(action + 0.5) < 1e-4
         found = f"a tiny MPC in {time.perf_counter() - begin:.2f} s" if right else f"u = {action:g} instead of -0.5"

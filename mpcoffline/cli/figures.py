@@ -137,20 +137,17 @@ def plot(
 
 
 def _task_of(learner: OfflineMPCLearner) -> str:
-    """The task with as many states and inputs as the learner; no two have the same."""
-    import gymnasium as gym
+    """The first task with as many states and inputs as the learner; of this package's no two have the same."""
+    from mpcoffline.envs import PLANTS
 
-    from mpcoffline.envs import ENV_IDS
-
-    sizes = (learner.nominal_mpc.nx,), (learner.nominal_mpc.nu,)
-    for env_id in ENV_IDS:
-        task = gym.make(env_id)
-        if (task.observation_space.shape, task.action_space.shape) == sizes:
-            return env_id
+    nominal = learner.nominal_mpc
+    for plant in PLANTS.values():
+        if (len(plant.observations), len(plant.inputs)) == (nominal.nx, nominal.nu):
+            return plant.id
     raise InvalidArgumentError(
         "learner",
-        expected=f"one of a task that can be drawn ({', '.join(ENV_IDS)})",
-        actual=f"{sizes[0][0]} states and {sizes[1][0]} inputs",
+        expected=f"one of a task that can be drawn ({', '.join(plant.id for plant in PLANTS.values())})",
+        actual=f"{nominal.nx} states and {nominal.nu} inputs",
     )
 
 

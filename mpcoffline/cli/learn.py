@@ -23,7 +23,7 @@ from .common import (
     Seed,
     Start,
     Task,
-    ValueForm,
+    Value,
     check_out,
     console,
     examples,
@@ -73,10 +73,7 @@ def learn(
         ),
     ] = Preset.default,
     learn: Annotated[Learn, typer.Option(help="cost: MPC_2; cost+model: MPC_3.")] = Learn.cost_and_model,
-    value: Annotated[
-        ValueForm | None,
-        typer.Option(help="Method of (VALUE); residual is the published one.", show_default="the preset's"),
-    ] = None,
+    value: Value = None,
     discount: Annotated[
         float | None, typer.Option(help="gamma, in (0, 1).", show_default="the preset's", min=0.0, max=1.0)
     ] = None,
@@ -118,7 +115,7 @@ def learn(
         "cost" if learn is Learn.cost else "cost+model",
         preset.value,
         seed,
-        value=None if value is None else value.value,
+        value=value,
         **{name: number for name, number in overrides.items() if number is not None},
     )
     begin = time.perf_counter()
@@ -224,8 +221,9 @@ def _described(learner: OfflineMPCLearner, data: MinariDataset) -> dict[str, Any
     return {
         "dataset": str(data.spec.dataset_id),
         "preset": learner.preset,
+        "method": learner.method.name,
         "learn": learner.learn,
-        "value_method": learner.config.value.method,
+        "value_method": learner.method.options.get("value"),
         "seed": learner.seed,
         "discount": learner.mpc.discount,
         "horizon": learner.mpc.horizon,

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from mpcoffline.core.tables import Table
 
-from .common import Alpha, PlantAlpha, Preset, Seed, TaskArgument, ValueForm, console, examples, say, say_file
+from .common import Alpha, PlantAlpha, Preset, Seed, TaskArgument, Value, console, examples, say, say_file
 
 app = typer.Typer()
 
@@ -31,10 +31,7 @@ def run(
     seed: Seed = 0,
     dataset: Annotated[str | None, typer.Option(help="Data set id.", show_default="the task's DDPG data")] = None,
     episodes: Annotated[int, typer.Option(help="Closed-loop episodes of each controller.", min=1)] = 24,
-    value: Annotated[
-        ValueForm | None,
-        typer.Option(help="Method of (VALUE).", show_default="residual, the published one; of another preset, its own"),
-    ] = None,
+    value: Value = None,
     preset: Annotated[Preset, typer.Option(help="How MPC_2 and MPC_3 are learned; paper is the published recipe.")] = (
         Preset.paper
     ),
@@ -52,7 +49,7 @@ def run(
 
     options: dict[str, Any] = {} if preset is Preset.paper else {"preset": preset.value}
     if value is not None:
-        options["value"] = value.value
+        options["value"] = value
     folder = output or Path("results") / task.value
     result = run_task(
         task.value,

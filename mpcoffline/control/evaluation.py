@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -26,7 +27,7 @@ from mpcoffline.datasets.record.plants import (
     step_cap,
 )
 from mpcoffline.datasets.record.stage_cost import PlantInfo, number_of, reward_of
-from mpcoffline.datasets.record.watching import PlantWatch
+from mpcoffline.datasets.record.watching import PlantWatch, watched
 from mpcoffline.envs import ControlTask
 from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.solvers.fallback import SolverStats, failures_in_words
@@ -110,7 +111,7 @@ def evaluate(
         n_episodes: Number of episodes.
         seed: Seed of the first episode.
         discount: gamma of the discounted cost.
-        options: ``reset`` options, the same for all episodes or one a episode.
+        options: ``reset`` options, the same for all episodes or one an episode.
         cost_key: The key of ``info`` that *is* the stage cost, minus the plant's reward; by default ``"cost"``, where
             it proves to be. A key that is named must be there and equal at each step.
         max_episode_steps: Steps after which an episode is one without end, an error; by default 10,000, or the
@@ -134,8 +135,9 @@ def evaluate(
     if len(each) != number:
         raise InvalidArgumentError("options", expected=f"{number} entries", actual=str(len(each)))
     given = opened(env)
-    rule, cap = PlantInfo("evaluate", cost_key), step_cap(given, max_episode_steps)
+    rule = PlantInfo("evaluate", cost_key)
     try:
+        cap = step_cap(given, max_episode_steps)
         check_spaces(policy, given, narrower=is_mpc(policy))
         if is_mpc(policy):
             check_units(given)
@@ -172,12 +174,10 @@ def _run(
     """The episodes: of copies that step together, or one after the other where no copy can be made."""
     if spec is None:
         return _one_after_the_other(policy, given, options, seed, rule, cap)
-    episodes = [_Episode(gym.make(spec), seed + i, option, rule, i) for i, option in enumerate(options)]
-    try:
+    with ExitStack() as stack:
+        envs = [stack.enter_context(closing(gym.make(spec))) for _ in options]
+        episodes = [_Episode(PlantWatch(env), seed + i, options[i], rule, i) for i, env in enumerate(envs)]
         _step_together(policy, episodes, cap)
-    finally:
-        for episode in episodes:
-            episode.close()
     return episodes
 
 
@@ -198,7 +198,7 @@ def _evaluate_as_arrays(
 ) -> Evaluation:
     """Our own tasks: their vector twin, which equals them bit for bit and ends all episodes at the same step."""
     n = len(options)
-    env = gym.make_vec(spec, num_envs=n, vectorization_mode="vector_entry_point", render_mode=None)
+    env = gym.make_vec(spec, num_envs=n, vectorization_mode="vector_entry_point", render_mode=None)  # nothing to close
     observations, info = env.reset(seed=seed, options=list(options))  # type: ignore[arg-type]  # our twin takes a list
     state: Any = None
     first, done = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -230,12 +230,9 @@ def _one_after_the_other(
     """Steps the given environment itself."""
     episodes = []
     for i, option in enumerate(options):
-        episode = _Episode(env, seed + i, option, rule, i, unchanged=is_mpc(policy))
-        try:
-            _step_together(policy, [episode], cap)
-        finally:
-            episode.watch.remove()
-        episodes.append(episode)
+        with watched(env) as watch:
+            episodes.append(_Episode(watch, seed + i, option, rule, i, unchanged=is_mpc(policy)))
+            _step_together(policy, episodes[-1:], cap)
     return episodes
 
 
@@ -256,7 +253,7 @@ class _Episode:
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        watch: PlantWatch,
         seed: int,
         options: dict[str, Any],
         rule: PlantInfo,
@@ -264,9 +261,8 @@ class _Episode:
         *,
         unchanged: bool = False,
     ) -> None:
-        self._env, self._rule, self._number, self._unchanged = env, rule, number, unchanged
-        self.watch = PlantWatch(env)
-        self.observation, info = env.reset(seed=seed, options=options or None)
+        self._watch, self._rule, self._number, self._unchanged = watch, rule, number, unchanged
+        self.observation, info = watch.env.reset(seed=seed, options=options or None)
         self.success = self.done = False
         self.observations: list[Any] = [np.array(self.observation)]
         self._first = rule.state(info, reset=True)
@@ -290,11 +286,11 @@ class _Episode:
         """Steps the environment unless the episode is over."""
         if self.done:
             return
-        observation, reward, terminated, truncated, info = self._env.step(action)
+        observation, reward, terminated, truncated, info = self._watch.env.step(action)
         if self._unchanged:
-            check_unchanged(self._env, self.watch, action, observation)
+            check_unchanged(self._watch.env, self._watch, action, observation)
         given = reward_of(f"env, episode {self._number}", reward)
-        paid = given if self.watch.reward is None else self.watch.reward
+        paid = given if self._watch.reward is None else self._watch.reward
         self._costs.append(self._rule.cost(info, paid, given))
         self._rewards.append(paid)
         self._states.append(self._rule.state(info))
@@ -306,7 +302,3 @@ class _Episode:
             self.observation = observation
             if len(self.actions) >= cap:
                 raise no_end(f"env, episode {self._number}", cap)
-
-    def close(self) -> None:
-        """Closes the environment."""
-        self._env.close()

@@ -18,7 +18,7 @@ from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, hol
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers import Plan, Solver, check_solver, make_solver
+from mpcoffline.solvers import SOLVERS, Plan, Solver, changed_options, check_solver, make_solver
 from mpcoffline.solvers.fallback import Fallback, SolverStats
 from mpcoffline.solvers.options import OF_THE_MACHINE
 
@@ -48,7 +48,8 @@ class MPCPolicy(BasePolicy):
 
     Args:
         mpc: The MPC; its state is the environment's observation.
-        solver: Name of the solver, see :func:`mpcoffline.make_solver`.
+        solver: Name of the solver, see :func:`mpcoffline.make_solver`; or a solver of this very MPC.
+            A policy's file names solver and options, so that to save one, an own class must be registered.
         observation_space: The environment's; unbounded by default.
         action_space: The environment's; float32 with the MPC's input bounds by default.
         exploration_noise: sigma, a fraction of the action range; SB3's customary ``NormalActionNoise`` of 0.1 in
@@ -65,14 +66,14 @@ class MPCPolicy(BasePolicy):
 
     Raises:
         InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, a negative noise or seed, a
-            ``rescue_time`` that is not positive, or an option that the solver has not.
+            ``rescue_time`` that is not positive, or an option that the solver has not, or a solver of another MPC.
         UnknownIdError: For an unknown solver or rescue.
     """
 
     def __init__(
         self,
         mpc: MPC,
-        solver: str = "auto",
+        solver: str | Solver = "auto",
         *,
         observation_space: spaces.Box | None = None,
         action_space: spaces.Box | None = None,
@@ -94,13 +95,23 @@ class MPCPolicy(BasePolicy):
         ):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
                 raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
-        check_solver(solver, solver_options)
+        made = solver if isinstance(solver, Solver) else None
+        if made is None:
+            check_solver(cast("str", solver), solver_options)
+        elif made.mpc is not mpc or solver_options:
+            raise InvalidArgumentError(
+                "solver",
+                expected="a name with options, or a solver of this very MPC without",
+                actual=f"{made!r}{' of another MPC' * (made.mpc is not mpc)}, options {list(solver_options)}",
+            )
         super().__init__(observation_space, action_space)
-        self.mpc, self.solver_name, self.solver_options = mpc, solver, solver_options
+        self.mpc, self._made = mpc, made
+        self.solver_name = solver if isinstance(solver, str) else solver.name
+        self.solver_options = solver_options if made is None else changed_options(made)
         self._fallback = Fallback(mpc, rescue, rescue_time)
         self.exploration_noise = exploration_noise
         self.set_random_seed(seed)
-        self._solver: Solver | None = None
+        self._solver = made
         self._vec_normalize: VecNormalize | None = None
         self._clipping_reported = False
 
@@ -157,8 +168,8 @@ class MPCPolicy(BasePolicy):
         return policy
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the solver, which is compiled code: a copy builds its own when first used."""
-        return self.__dict__ | {"_solver": None}
+        """Everything but a solver that was named, which is compiled code: a copy builds its own when first used."""
+        return self.__dict__ | {"_solver": self._made}
 
     @property
     def solver(self) -> Solver:
@@ -299,7 +310,18 @@ class MPCPolicy(BasePolicy):
 
         Of the solver's options, those that say how many cores are used (``n_threads``, ``n_workers``) are left out:
         they are the machine's, not the controller's.
+
+        Raises:
+            InvalidArgumentError: For a solver of a class that is not registered, which no file can name, or an MPC that
+                has no JSON form; nothing is written then.
         """
+        if self.solver_name != "auto" and self.solver_name not in SOLVERS:
+            raise InvalidArgumentError(
+                "solver",
+                expected="one that is registered, which a file can name",
+                actual=self.solver_name,
+                hint="Register its class: SOLVERS.register of mpcoffline.solvers.",
+            )
         observation_space = self.observation_space
         assert isinstance(observation_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
         document = {

@@ -28,7 +28,7 @@ from mpcoffline.core.outputs import replaced
 
 from .errors import FileFormatError, MPCOfflineError
 
-_VERSION = 1
+_VERSION = 2
 _DOCUMENT, _ARRAYS = "mpcoffline.json", "arrays.npz"
 _LOCAL = struct.Struct("<4s5HL")  # how a member begins: its CRC-32 comes last
 _END = struct.Struct("<4s4H2LH")  # the last record of a zip: 22 bytes, and a comment, of which we write none

@@ -1,7 +1,9 @@
-"""How much the caches hold, and what goes when that is too much: what was not used for longest."""
+"""What the caches hold: notes about files, and how much in all; what was not used for longest goes first."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
 import shutil
@@ -9,14 +11,17 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from .files import read_limited
+from .outputs import write_file
 from .places import cache_root, distrusted, temporary_root, warn_once
 
 KINDS = ("solvers", "tables", "checked")
 DEFAULT_SIZE = 20 * 10**9
 # What is kept has the name of a digest: whatever else a user has in the folder that MPCOFFLINE_CACHE names is his own.
 _NAME = re.compile(r"(?:[a-z]+-)?[0-9a-f]{24,64}(?:\.[a-z0-9]+)?")
+_NOTE_BYTES = 1000
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
@@ -70,6 +75,27 @@ def disk_size(path: Path) -> int:
         with suppress(OSError):
             total += file.lstat().st_blocks * 512
     return total
+
+
+def read_note(cache: Path, subject: Path) -> Any:
+    """What :func:`write_note` kept of a file or folder, from JSON; None where nothing that can be read is there."""
+    try:
+        return json.loads(read_limited(_note(cache, subject), _NOTE_BYTES))
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def write_note(cache: Path, subject: Path, content: object) -> None:
+    """Keeps a little about a file or folder, as JSON, under a digest of where it is.
+
+    Raises:
+        StorageError: Where the cache cannot be written.
+    """
+    write_file(_note(cache, subject), json.dumps(content))
+
+
+def _note(cache: Path, subject: Path) -> Path:
+    return cache / f"{hashlib.sha256(os.fsencode(subject.resolve())).hexdigest()[:32]}.json"
 
 
 def mark_used(path: Path) -> None:

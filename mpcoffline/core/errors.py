@@ -56,12 +56,12 @@ class UnknownIdError(MPCOfflineError, LookupError):
             kind: What the name stands for, e.g. ``"dataset id"``.
             given: The unknown name, or whatever was given in place of one.
             known: All names that would have been right.
-            hint: What to do next; by default the nearest names are proposed.
+            hint: What else to do next.
         """
         names = sorted(known)
         nearest = difflib.get_close_matches(given, names, n=3, cutoff=0.4) if isinstance(given, str) else []
-        if not hint and nearest:
-            hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}?"
+        if nearest:
+            hint = f"Did you mean {' or '.join(repr(name) for name in nearest)}? {hint}".rstrip()
         return cls(kind, expected=f"one of {', '.join(names) or '(none)'}", actual=f"{given!r:.200}", hint=hint)
 
 

@@ -1,4 +1,4 @@
-"""Files that users name for results: replaced only as a whole, and refused before the work, not after it.
+"""Files that appear complete or not at all: replaced only as a whole, and refused before the work, not after it.
 
 What exists and is no regular file (a device, a FIFO, a socket, a folder) is never opened and never replaced.
 """
@@ -9,7 +9,6 @@ import fcntl
 import os
 import re
 import tempfile
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,20 +16,19 @@ from os import PathLike
 from pathlib import Path
 from typing import IO
 
-from mpcoffline.core.files import check_regular
-
+from .atomic import sync_folder
 from .errors import FileFormatError, StorageError
+from .files import check_regular
 
 _UNIQUE = re.compile("[0-9a-f]{12}")
-_JUST_NOW = 60.0  # s
 
 
 @contextmanager
 def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     """A new file that takes its name once it is complete and on the disk; until then, what was there stays.
 
-    A symbolic link stays one: what it points to is replaced. Where the old file may not be written, nothing is. What a
-    killed process has left of the same name goes first.
+    A symbolic link stays one: what it points to is replaced, and keeps its permissions. Where the old file may not be
+    written, nothing is. What a killed process has left of the same name goes first.
 
     Args:
         path: Its name.
@@ -46,14 +44,15 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     temporary = target.with_name(f"{begin}{uuid.uuid4().hex[:12]}")
     try:
         _remove_abandoned(target.parent, begin)
-        with temporary.open("xb") as file:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX)
+        with _locked(temporary) as file:
+            with suppress(OSError):  # there is none, or its mode cannot be had
+                os.fchmod(file.fileno(), target.stat().st_mode & 0o777)
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, target)
-        _sync_folder(target.parent)
+            os.replace(temporary, target)  # while it is locked: nobody takes it for abandoned
+        with suppress(OSError):  # a file system that cannot say so
+            sync_folder(target.parent)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
@@ -62,15 +61,27 @@ def replaced(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
         raise
 
 
+def _locked(path: Path) -> IO[bytes]:
+    """A new file with a lock: who looks for abandoned ones may have taken the first before it had one."""
+    while True:
+        file = path.open("xb")
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        with suppress(FileNotFoundError):
+            if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                return file
+        file.close()
+
+
 def _remove_abandoned(folder: Path, begin: str) -> None:
     """Removes the temporary files that nobody writes any more: the system gives their locks back with their process."""
     with suppress(OSError), os.scandir(folder) as entries:
-        names = [e.name for e in entries if e.name.startswith(begin) and _UNIQUE.fullmatch(e.name[len(begin) :])]
-        for name in names:
-            with suppress(OSError), (folder / name).open("rb") as file:
-                if time.time() - os.fstat(file.fileno()).st_mtime > _JUST_NOW:  # it may not be locked yet
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    (folder / name).unlink()
+        ours = [e for e in entries if e.name.startswith(begin) and _UNIQUE.fullmatch(e.name[len(begin) :])]
+        for path in (entry.path for entry in ours if entry.is_file(follow_symlinks=False)):
+            # Not to wait for a writer, should it have become a FIFO since.
+            with suppress(OSError), open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.unlink(path)
 
 
 def write_file(path: str | PathLike[str], content: bytes | str) -> Path:
@@ -165,13 +176,3 @@ def _check_takes_files(folder: Path) -> None:
             file.write(b"0")
     except OSError as error:
         raise StorageError.of(f"in folder {folder}", OSError(error.strerror or str(error))) from error
-
-
-def _sync_folder(folder: Path) -> None:
-    """Waits until the new name is on the disk, where the file system can say so."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -9,6 +9,7 @@ import signal
 import sys
 import traceback
 import weakref
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,6 +18,7 @@ from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from .checks import check_integers
 from .errors import MPCOfflineError
+from .registry import Registry
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -43,42 +45,95 @@ def n_cpus() -> int:
     return os.cpu_count() or 1
 
 
+class Executor(ABC, Generic[Job, Result]):
+    """Applies a function to jobs, round after round, somewhere: here, in processes, on other machines.
+
+    Results do not depend on where. An own one subclasses this, and is registered in :data:`EXECUTORS`.
+
+    Args:
+        fn: What to do with a job; where it travels, it is pickled once, and can keep what is expensive to build.
+        n: How many jobs may be worked on at a time.
+    """
+
+    @abstractmethod
+    def __init__(self, fn: Callable[[Job], Result], n: int) -> None: ...
+
+    @abstractmethod
+    def run(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Result]]:
+        """Yields names and results as they come.
+
+        An error, Ctrl-C, or a consumer that stops early ends all work. A job whose worker is lost is given to another.
+
+        Raises:
+            JobError: If a job raises, or loses its workers again and again.
+        """
+
+    def map(self, jobs: Mapping[str, Job], on_done: Callable[[str], None] | None = None) -> list[Result]:
+        """The results in the order of the jobs.
+
+        Args:
+            jobs: The jobs by name.
+            on_done: Called here with a job's name whenever one is done.
+
+        Raises:
+            JobError: As :meth:`run`.
+        """
+        results: dict[str, Result] = {}
+        for name, result in self.run(jobs):
+            results[name] = result
+            if on_done is not None:
+                on_done(name)
+        return [results[name] for name in jobs]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets go of what works."""
+
+
+#: Where jobs can be done, by name.
+EXECUTORS: Registry[type[Executor[Any, Any]]] = Registry("executor", Executor)
+
+
 def map(
     fn: Callable[[Job], Result],
     jobs: Mapping[str, Job] | Sequence[Job],
     workers: int | None = None,
     on_done: Callable[[str], None] | None = None,
+    executor: str = "processes",
 ) -> list[Result]:
     """Applies a function to every job, several at a time, each in a process with one thread.
 
     The processes are spawned, not forked: nothing of this process but ``fn`` and the job reaches them (both are
     pickled, so ``fn`` must be a function of a module). The results do not depend on the number of workers. Ctrl-C
-    ends all workers.
+    ends all workers. A job whose process dies is done once more.
 
     Args:
         fn: What to do with a job.
         jobs: The jobs; those of a mapping are called by their keys in error messages, others by their numbers.
         workers: Number of processes; the number of CPU cores by default. One runs the jobs here, one by one.
         on_done: Called here with a job's name whenever one is done.
+        executor: Where several are done, a name in :data:`EXECUTORS`.
 
     Returns:
         The results in the order of the jobs.
 
     Raises:
         InvalidArgumentError: For ``workers`` below 1.
-        JobError: If a job raises or its process dies; the others are stopped.
+        UnknownIdError: For an unknown executor.
+        JobError: If a job raises or its process dies twice; the others are stopped.
     """
     named = dict(jobs) if isinstance(jobs, Mapping) else {str(i): job for i, job in enumerate(jobs)}
     if workers is not None:
         check_integers(1, workers=workers)
     n_workers = min(n_cpus() if workers is None else workers, len(named))
-    finished = _run_here(fn, named) if n_workers <= 1 else _run_in_processes(fn, named, n_workers)
-    results: dict[str, Result] = {}
-    for name, result in finished:
-        results[name] = result
-        if on_done is not None:
-            on_done(name)
-    return [results[name] for name in named]
+    chosen = EXECUTORS[executor if n_workers > 1 else "serial"]
+    with chosen(fn, n_workers) as pool:
+        return pool.map(named, on_done)
 
 
 class _Outcome(NamedTuple):
@@ -89,54 +144,41 @@ class _Outcome(NamedTuple):
     traceback: str = ""
 
 
-def _run_here(fn: Callable[[Job], Result], jobs: Mapping[str, Job]) -> Iterator[tuple[str, Result]]:
-    with _one_torch_thread():
-        for name, job in jobs.items():
-            try:
-                result = fn(job)
-            except Exception as error:
-                raise _job_error(name, _described(error), traceback.format_exc()) from error
-            yield name, result
+@EXECUTORS.register("serial")
+class Serial(Executor[Job, Result]):
+    """Does the jobs here, one by one, with one thread of torch."""
+
+    def __init__(self, fn: Callable[[Job], Result], n: int = 1) -> None:
+        self._fn = fn
+
+    def run(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Result]]:
+        """See :class:`Executor`."""
+        with _one_torch_thread():
+            for name, job in jobs.items():
+                try:
+                    result = self._fn(job)
+                except Exception as error:
+                    raise _job_error(name, _described(error), traceback.format_exc()) from error
+                yield name, result
 
 
-def _run_in_processes(
-    fn: Callable[[Job], Result], jobs: Mapping[str, Job], n_workers: int
-) -> Iterator[tuple[str, Result]]:
-    with Workers(fn, n_workers) as workers:
-        yield from workers.run(jobs)
+@EXECUTORS.register("processes")
+class Processes(Executor[Job, Result]):
+    """Does the jobs in n processes of their own, each with one thread; they live until :meth:`close`.
 
-
-class Workers(Generic[Job, Result]):
-    """Processes that apply a function to jobs, round after round; :func:`map` is one round.
-
-    Each process unpickles ``fn`` once: a callable object can keep what is expensive to build between jobs.
-
-    Args:
-        fn: What to do with a job; it is pickled.
-        n: Number of processes.
+    Each process unpickles ``fn`` once. Where one dies, another takes its place and its job, once for each job.
     """
 
     def __init__(self, fn: Callable[[Job], Result], n: int) -> None:
-        self._workers = _start_workers(fn, n)
+        self._fn, self._workers = fn, _start_workers(fn, n)
         # Also runs when the object is forgotten, and when the interpreter ends.
         self._stop = weakref.finalize(self, _end_all, self._workers, os.getpid())
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def run(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Result]]:
-        """Hands each idle worker the next job; yields names and results as they come.
-
-        An error, Ctrl-C, or a consumer that stops early ends all workers.
-
-        Raises:
-            JobError: If a job raises or its process dies.
-        """
+        """Hands each idle worker the next job; see :class:`Executor`."""
         waiting = deque(jobs.items())
         busy: dict[Connection, str] = {}
+        lost: set[str] = set()
         complete = False
         try:
             for connection in self._workers:
@@ -145,7 +187,22 @@ class Workers(Generic[Job, Result]):
                 for ready in wait(list(busy)):
                     connection = next(c for c in busy if c is ready)
                     name = busy.pop(connection)
-                    yield name, _received(name, connection, self._workers[connection])
+                    try:
+                        outcome = connection.recv()
+                    except (EOFError, OSError) as error:
+                        process = self._workers.pop(connection)
+                        connection.close()
+                        process.join(_JOIN_TIMEOUT)
+                        if name in lost:
+                            raise _lost(name, process.exitcode) from error
+                        lost.add(name)
+                        waiting.appendleft((name, jobs[name]))
+                        self._workers |= (another := _start_workers(self._fn, 1))
+                        (connection,) = another
+                    else:
+                        if outcome.error:
+                            raise _job_error(name, outcome.error, outcome.traceback)
+                        yield name, outcome.result
                     _hand_next(connection, waiting, busy)
             complete = True
         finally:
@@ -191,20 +248,9 @@ def _hand_next(connection: Connection, waiting: deque[tuple[str, Any]], busy: di
             connection.send((job,))
 
 
-def _received(name: str, connection: Connection, process: multiprocessing.context.SpawnProcess) -> Any:
-    try:
-        outcome = connection.recv()
-    except (EOFError, OSError) as error:
-        process.join(_JOIN_TIMEOUT)
-        code = process.exitcode
-        raise _job_error(
-            name,
-            f"a process that ended with code {code}",
-            hint="In a script, call this under `if __name__ == '__main__':`." if code == 1 else "Out of memory?",
-        ) from error
-    if outcome.error:
-        raise _job_error(name, outcome.error, outcome.traceback)
-    return outcome.result
+def _lost(name: str, code: int | None) -> JobError:
+    hint = "In a script, call this under `if __name__ == '__main__':`." if code == 1 else "Out of memory?"
+    return _job_error(name, f"a process that ended with code {code}, as another before", hint=hint)
 
 
 def _work(fn: Callable[[Any], Any], connection: Connection) -> None:

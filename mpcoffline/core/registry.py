@@ -25,7 +25,7 @@ class Registry(Generic[T]):
     Args:
         kind: What messages call one of them.
         base: The class that each must be a subclass of (where it is a class) or an instance of; by default any thing.
-        methods: Methods that each must have, beside the abstract ones of ``base``.
+        methods: Methods that each must have, beside the abstract ones of ``base``; ``"a|b"`` asks for one of them.
     """
 
     def __init__(self, kind: str, base: type[Any] = object, methods: tuple[str, ...] = ()) -> None:
@@ -55,8 +55,8 @@ class Registry(Generic[T]):
         if not right:
             raise InvalidArgumentError(what, expected=f"a {self._base.__name__}", actual=repr(thing)[:200])
         abstract = getattr(thing, "__abstractmethods__", ()) if inspect.isabstract(thing) else ()
-        missing = sorted({*abstract, *(method for method in self._methods if not hasattr(thing, method))})
-        if missing:
+        absent = (each for each in self._methods if not any(hasattr(thing, name) for name in each.split("|")))
+        if missing := sorted({*abstract, *absent}):
             raise InvalidArgumentError(what, expected=f"the methods {', '.join(missing)}", actual="none of them")
         self._things[name] = thing
         return thing
@@ -84,6 +84,14 @@ class Registry(Generic[T]):
             actual=f"{name!r:.80}",
             hint=f"If it is one of your own or of another package, import what registers that {self.kind} first.",
         )
+
+    def name_of(self, thing: object) -> str:
+        """What a thing is called here; empty where it is not: a subclass is another thing."""
+        return next((name for name, known in self._things.items() if known is thing), "")
+
+    def shared_name_of(self, thing: type[Any]) -> str:
+        """As :meth:`name_of`, but of classes of this package alone: what another process knows too."""
+        return self.name_of(thing) if thing.__module__.split(".")[0] == __name__.split(".")[0] else ""
 
     def items(self) -> ItemsView[str, T]:
         """Names and things."""

@@ -44,7 +44,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
     except Timeout as error:
         raise OSError(f"the lock of {folder} cannot be had") from error
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
         lock.release()
 
 
@@ -64,7 +64,13 @@ def remove_abandoned(folder: Path) -> None:
         folder.rmdir()
         return
     if _is_abandoned(folder):
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """The lock goes last: what a killed process leaves of the rest is abandoned as well."""
+    shutil.rmtree(folder / _CONTENT, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_abandoned(folder: Path) -> bool:
@@ -73,7 +79,15 @@ def _is_abandoned(folder: Path) -> bool:
             return True
         if not (folder / _LOCK).is_file():
             return time.time() - folder.stat().st_mtime > _HOUR
-        with FileLock(folder / _LOCK, timeout=0.0, thread_local=False):
+        return is_free(folder / _LOCK)
+    except OSError:  # another user's
+        return False
+
+
+def is_free(lock: Path) -> bool:
+    """Whether no living process holds a lock file that this one may open."""
+    try:
+        with FileLock(lock, timeout=0.0, thread_local=False):
             return True
-    except (OSError, Timeout):  # another user's, or a living process's
+    except (OSError, Timeout):
         return False

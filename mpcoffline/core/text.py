@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable
 from functools import lru_cache
 
@@ -85,14 +86,16 @@ def c_identifiers(names: Iterable[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     taken: set[str] = set()
+    alike: Counter[str] = Counter()  # where the search goes on, which must not begin anew for each of thousands
     for name in sorted(names, key=lambda name: re.fullmatch(r"[A-Za-z0-9_.]+", name) is None):  # in order otherwise
         plain = "".join(c if c.isascii() else _spelled(c) for c in name)
         stem = re.sub(r"_+", "_", re.sub(r"\W", "_", plain, flags=re.ASCII)).strip("_") or "p"
         if not stem[0].isalpha() or _KEYWORD.fullmatch(stem):
             stem = f"p_{stem}"
-        identifier, k = stem, 2
+        identifier = stem
         while identifier in taken:
-            identifier, k = f"{stem}_{k}", k + 1
+            alike[stem] += 1
+            identifier = f"{stem}_{alike[stem] + 1}"
         taken.add(identifier)
         found[name] = identifier
     return found

@@ -7,26 +7,18 @@ from .check.repairing import RepairReport as RepairReport
 from .check.repairing import repair as repair
 from .check.replaying import ReplayReport as ReplayReport
 from .check.replaying import replay as replay
+from .hub.loading import load_dataset as load_dataset
 from .hub.transfer import download_dataset as download_dataset
 from .hub.transfer import upload_dataset as upload_dataset
-from .interop.convert import (
-    to_d3rlpy as to_d3rlpy,
-)
-from .interop.convert import (
-    to_dict as to_dict,
-)
-from .interop.convert import (
-    to_sb3_replay_buffer as to_sb3_replay_buffer,
-)
-from .interop.convert import (
-    to_torchrl as to_torchrl,
-)
-from .record.logs import dataset_from_arrays as dataset_from_arrays
-from .record.logs import from_csv as from_csv
-from .record.logs import record as record
+from .interop.convert import to_d3rlpy as to_d3rlpy
+from .interop.convert import to_dict as to_dict
+from .interop.convert import to_sb3_replay_buffer as to_sb3_replay_buffer
+from .interop.convert import to_torchrl as to_torchrl
+from .record.from_arrays import dataset_from_arrays as dataset_from_arrays
+from .record.from_csv import from_csv as from_csv
 from .record.recorder import MinariRecorder as MinariRecorder
+from .record.rollouts import record as record
 from .store.local import list_datasets as list_datasets
-from .store.local import load_dataset as load_dataset
 from .store.verification import VerifyReport as VerifyReport
 from .store.verification import verify as verify
 from .table.transitions import TransitionTable as TransitionTable

@@ -11,16 +11,20 @@ from typing import Any
 
 import gymnasium as gym
 
-import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.checks import check_integers, check_known, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.envs import PLANTS
 
-TASKS = ("linear", "pendulum", "cartpole")
+
+def recorded_tasks() -> tuple[str, ...]:
+    """Short names of the registered plants that have a recipe."""
+    return tuple(name for name, plant in PLANTS.items() if plant.catalog is not None)
 
 
-def catalog_file(name: str) -> Traversable:
-    """A file of the resource package ``mpcoffline.datasets.catalog``."""
-    return importlib.resources.files("mpcoffline.datasets.catalog").joinpath(name)
+def catalog_file(name: str, task: str | None = None) -> Traversable:
+    """A file beside a plant's recipe; by default of the resource package ``mpcoffline.datasets.catalog``."""
+    package = (task and PLANTS[task].catalog) or "mpcoffline.datasets.catalog"
+    return importlib.resources.files(package).joinpath(name)
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Recipe:
     """How a data set is collected: environment, agent, and how the agent scales what it sees.
 
     Attributes:
-        task: Short name of the task, one of :data:`TASKS`.
+        task: Short name of the plant.
         dataset_id: Minari id.
         description: One sentence.
         env_id: Gymnasium id.
@@ -75,13 +79,13 @@ class Recipe:
         """Reads the recipe of a task.
 
         Args:
-            task: One of :data:`TASKS`.
+            task: One of :func:`recorded_tasks`.
 
         Raises:
             UnknownIdError: For any other name.
         """
-        check_known("task", task, TASKS)
-        content = tomllib.loads(catalog_file(f"{task}.toml").read_text(encoding="utf-8"))
+        check_known("task", task, recorded_tasks())
+        content = tomllib.loads(catalog_file(f"{task}.toml", task).read_text(encoding="utf-8"))
         environment, training = content["environment"], content["training"]
         hyperparameters = dict(training["hyperparameters"])
         return cls(

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 _STARTS = 20
 _FEW_STARTS = 3
+_SLOW = 10.0  # times as fast as ipopt, below which simulating all starts takes minutes
 _SCARCE_GOAL = 1e-3
 _BLIND_VALUE = 0.3
 _WORSE_MODEL = 2.0
@@ -68,8 +69,8 @@ def diagnose(
     Args:
         learner: A fitted learner.
         dataset: What it was fitted on, or another log of the same plant.
-        n_starts: Episodes simulated on each model; 20 by default, 3 where a controller needs ipopt (with constraints),
-            which takes minutes even so.
+        n_starts: Episodes simulated on each model; 20 by default, 3 where a controller needs a slow solver (ipopt,
+            with constraints), which takes minutes even so.
         n_steps: Their length.
         seed: Seeds the ensemble and the choice of starts.
 
@@ -90,7 +91,7 @@ def diagnose(
     ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
     cost = LoggedCost(clean, seed)
     policies = MPCPolicy(nominal), MPCPolicy(learned)
-    slow = any(policy.solver.name == "ipopt" for policy in policies)
+    slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
     starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
     first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
     comparison = Comparison.of(first, second, cost.r2)
@@ -122,7 +123,7 @@ def diagnose(
             reference,
         ),
     )
-    return report.with_notes(_notes(report, smoothed=learner.config.init == "identified"))
+    return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:

@@ -15,7 +15,7 @@ from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman.equation import BellmanFit, variance_of
+from mpcoffline.learning.bellman.equation import BellmanProblem, variance_of
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
 from mpcoffline.mpc.parameters import Group
@@ -95,16 +95,15 @@ def returns_of(value: ValueFunction, table: TransitionTable, discount: float) ->
         discount: gamma.
     """
     needed = int(np.ceil(np.log(_TAIL) / np.log(discount))) if discount < 1.0 else len(table)
-    ids, firsts, lengths = np.unique(table.episode_ids, return_index=True, return_counts=True)
+    episodes, n_episodes = table.episodes, table.n_episodes
     observations, returns = [], []
-    for k in range(len(ids) - min(max(1, len(ids) // 10), _MOST_EPISODES), len(ids)):
-        rows = np.arange(firsts[k], firsts[k] + lengths[k])
-        episode = table.take(rows)
+    for k in range(n_episodes - min(max(1, n_episodes // 10), _MOST_EPISODES), n_episodes):
+        episode = table.take(episodes.rows(k))
         costs, ended = episode.costs.astype(np.float64), episode.terminations[-1] > 0.0
-        total = np.zeros(len(rows) + 1)
-        for t in range(len(rows) - 1, -1, -1):
+        total = np.zeros(len(episode) + 1)
+        for t in range(len(episode) - 1, -1, -1):
             total[t] = costs[t] + discount * total[t + 1]
-        complete = len(rows) if ended else max(0, len(rows) - needed)
+        complete = len(episode) if ended else max(0, len(episode) - needed)
         observations.append(episode.observations[:complete])
         returns.append(total[:complete])
     return value.predict(np.concatenate(observations)), np.concatenate(returns)
@@ -132,16 +131,16 @@ def fit_errors(
         table: The transitions.
         result: What (FIT) found; its potential, if there is one, counts.
     """
-    sample = _sample(table, 0)
+    sample = table.sample(_ROWS, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
     unit = variance_of(sample.costs)
     before, after = (
-        _residuals(BellmanFit(mpc, value, unit), mpc, columns)
+        _residuals(BellmanProblem(mpc, value, unit), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)
     )
     potential = None if result is None else result.potential
     if potential is not None:
-        model = BellmanFit(learned, value, unit)
+        model = BellmanProblem(learned, value, unit)
         with torch.no_grad():
             reached = model.predicted(columns, torch.from_numpy(learned.theta))
             shaping = potential(columns.observations) - model.discounted(columns) * potential(reached)
@@ -158,7 +157,7 @@ def fit_errors(
     )
 
 
-def _residuals(problem: BellmanFit, mpc: MPC, columns: Columns) -> Array:
+def _residuals(problem: BellmanProblem, mpc: MPC, columns: Columns) -> Array:
     theta = torch.from_numpy(mpc.theta)
     with torch.no_grad():
         explained = problem.predicted_value(columns, theta) + problem.stage_cost(columns, theta)
@@ -170,7 +169,7 @@ def outside_support(table: TransitionTable, states: Array) -> float:
 
     By the distance to the nearest logged state, coordinates in spreads of the data.
     """
-    sample = _sample(table, 1, 2 * _TREE_ROWS)
+    sample = table.sample(2 * _TREE_ROWS, 1)
     spread = sample.observations.std(axis=0)
     scale = np.where(spread > 0.0, spread, 1.0).astype(np.float64)
     order = np.random.default_rng(0).permutation(len(sample))
@@ -185,13 +184,13 @@ def outside_support(table: TransitionTable, states: Array) -> float:
 
 def predicted_states(mpc: MPC, table: TransitionTable) -> Array:
     """f_theta(s, a) on some of the data, ``(n, nx)``."""
-    sample = _sample(table, 2, _TREE_ROWS)
+    sample = table.sample(_TREE_ROWS, 2)
     return mpc.model(sample.observations, sample.actions)
 
 
 def one_step_error(mpc: MPC, table: TransitionTable) -> float:
     """Root mean square one-step prediction error, every coordinate in the spread of its increments."""
-    sample = _sample(table, 3)
+    sample = table.sample(_ROWS, 3)
     s, reached = (v.astype(np.float64) for v in (sample.observations, sample.next_observations))
     missed = (mpc.model(s, sample.actions) - reached) / increments_scale(s, reached, table.centring.centre[: table.ny])
     return float(np.sqrt(np.mean(np.nan_to_num(missed, nan=1e3, posinf=1e3, neginf=-1e3) ** 2)))
@@ -251,9 +250,3 @@ def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
     before, after = (dict(zip(m.space.names, m.theta, strict=True)) for m in (nominal, mpc))
     on_bounds = Coordinates(mpc, get_args(Group)).at_bounds(mpc.theta)
     return tuple(name for name in on_bounds if before.get(name) != after[name])
-
-
-def _sample(table: TransitionTable, seed: int, count: int = _ROWS) -> TransitionTable:
-    """Some rows, in order."""
-    rows = np.sort(np.random.default_rng(seed).permutation(len(table))[:count])
-    return table.take(rows)

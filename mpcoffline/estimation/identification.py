@@ -98,8 +98,8 @@ class Identification:
         return float(np.sqrt(np.mean(self.errors_after**2)))
 
 
-class Steps(NamedTuple):
-    """The steps that are used, in float64."""
+class Transitions(NamedTuple):
+    """The transitions used, in float64."""
 
     x: Array
     u: Array
@@ -121,7 +121,7 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: Steps, centre: Array | float = 0.0) -> None:
+    def __init__(self, mpc: MPC, rows: Transitions, centre: Array | float = 0.0) -> None:
         self.coordinates = c = Coordinates(mpc, ("model",))
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
@@ -130,7 +130,7 @@ class OneStepProblem:
         self.names = [names[i] for i in self.free]
         self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
 
-    def on(self, rows: Steps) -> OneStepProblem:
+    def on(self, rows: Transitions) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
         other = copy.copy(self)
         other.rows = rows
@@ -289,17 +289,17 @@ def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> A
     return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
 
 
-def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Steps:
+def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Transitions:
     """A random subset in float64, small enough for its Jacobian."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
     count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
-    chosen = np.sort(rng.permutation(len(table))[:count])
-    columns = table.columns(table.rows[chosen])
+    sample = table.sample(count, rng)
+    columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)
-    return Steps(*(np.asarray(part, dtype=np.float64) for part in parts))
+    return Transitions(*(np.asarray(part, dtype=np.float64) for part in parts))
 
 
-def without_jumps(rows: Steps, errors: Array) -> tuple[Steps, tuple[int, ...]]:
+def without_jumps(rows: Transitions, errors: Array) -> tuple[Transitions, tuple[int, ...]]:
     """The rows with full turns removed from s+ in wrapped angles, and which coordinates these are.
 
     These are confined to one turn, and their prediction errors are either small or near a full turn.
@@ -322,7 +322,7 @@ def _best_descent(
     It starts again from elsewhere where the first start ends at a bound or explains nothing.
     """
     n, n_coordinates = problem.rows.x.shape
-    few = problem.on(Steps(*(part[:: max(1, n // _FEW_ROWS)] for part in problem.rows)))
+    few = problem.on(Transitions(*(part[:: max(1, n // _FEW_ROWS)] for part in problem.rows)))
 
     def weight(mean_square: float) -> float:
         """What a Gaussian prior weighs against the mean square error: sigma^2 / (n spread^2)."""

@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .identification import Steps
+from .identification import Transitions
 from .kalman import Linearised
 from .one_step import OneStep
 
@@ -79,9 +79,9 @@ class Trajectories:
         names = ("index", "valid", "s", "inputs", "reached", "turns")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
-    def rows(self) -> Steps:
+    def rows(self) -> Transitions:
         """The transitions, one after another."""
-        return Steps(self.s[self.valid], self.inputs[self.valid], self.reached[self.valid])
+        return Transitions(self.s[self.valid], self.inputs[self.valid], self.reached[self.valid])
 
     @property
     def counts(self) -> Array:

@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from mpcoffline.core.outputs import write_file
 from mpcoffline.core.tables import Table
 from mpcoffline.core.text import markdown
 from mpcoffline.datasets.recipes import Recipe
-from mpcoffline.envs import LinearTrackingEnv
+from mpcoffline.envs import PLANTS, ControlTask, Input, Plant, State
 from mpcoffline.envs.episode import DISCOUNT, EPISODE_STEPS
 
 from .collection import AgentScore, return_curve
@@ -36,28 +36,25 @@ class Axis:
         label: With its unit.
         source: ``"state"`` or ``"action"``.
         index: Coordinate.
+        angle: Whether it is an angle in rad that wraps.
     """
 
     label: str
     source: str
     index: int
+    angle: bool = False
+
+    @classmethod
+    def of(cls, coordinate: State | Input) -> Axis:
+        """The axis of a plant's coordinate."""
+        if isinstance(coordinate, Input):
+            return cls(coordinate.label, "action", coordinate.index)
+        return cls(coordinate.label, "state", coordinate.index, coordinate.angle)
 
 
-_PHI, _PHID = Axis("angle $\\varphi$ (rad)", "state", 0), Axis("speed $\\dot\\varphi$ (rad/s)", "state", 1)
-_POLE, _POLED = Axis(_PHI.label, "state", 2), Axis(_PHID.label, "state", 3)
-PANELS: dict[str, tuple[tuple[Axis, Axis], ...]] = {
-    "linear": (
-        (Axis("$x$ (m)", "state", 0), Axis("$y$ (m)", "state", 1)),
-        (Axis("$\\dot x$ (m/s)", "state", 2), Axis("$\\dot y$ (m/s)", "state", 3)),
-        (Axis("$F_x$ (N)", "action", 0), Axis("$F_y$ (N)", "action", 1)),
-    ),
-    "pendulum": ((_PHI, _PHID), (_PHI, Axis("torque $u$ (N m)", "action", 0))),
-    "cartpole": (
-        (Axis("position $x$ (m)", "state", 0), Axis("speed $\\dot x$ (m/s)", "state", 1)),
-        (_POLE, _POLED),
-        (_POLE, Axis("force $u$ (N)", "action", 0)),
-    ),
-}
+def panels_of(plant: Plant) -> list[tuple[Axis, Axis]]:
+    """The coverage panels of a plant's data."""
+    return [(Axis.of(plant.coordinate(x)), Axis.of(plant.coordinate(y))) for x, y in plant.coverage]
 
 
 def write_card(dataset: MinariDataset, recipe: Recipe, scores: Sequence[AgentScore], folder: Path) -> Path:
@@ -75,7 +72,7 @@ def write_card(dataset: MinariDataset, recipe: Recipe, scores: Sequence[AgentSco
     states, actions = _visited(dataset)
     costs = -return_curve(dataset)
     _save(return_figure(costs, scores), folder / f"{recipe.task}_returns.png")
-    _save(coverage_figure(PANELS[recipe.task], states, actions), folder / f"{recipe.task}_coverage.png")
+    _save(coverage_figure(panels_of(PLANTS[recipe.task]), states, actions), folder / f"{recipe.task}_coverage.png")
     card = folder / f"{recipe.task}.md"
     return write_file(card, _card_text(recipe, costs, states, actions, scores))
 
@@ -124,7 +121,7 @@ def coverage_figure(
     """Where the data lie: two-dimensional histograms of states and actions, logarithmic colours.
 
     Args:
-        panels: Horizontal and vertical axis of each histogram, e.g. :data:`PANELS` of a task.
+        panels: Horizontal and vertical axis of each histogram, e.g. those of :func:`panels_of`.
         states: Visited states s, ``(n, nx)``.
         actions: The actions taken there, ``(n, nu)``.
     """
@@ -155,11 +152,11 @@ def coverage_figure(
 
 
 def _shown_range(axis: Axis, values: NDArray[np.float64]) -> tuple[float, float]:
+    if axis.angle:
+        return -np.pi, np.pi
     if axis.source == "action":
         limit = float(np.abs(values).max())
-        return -limit, limit
-    if "varphi$ (rad)" in axis.label:
-        return -np.pi, np.pi
+        return (0.0 if values.min() >= 0.0 else -limit), limit
     limit = float(np.percentile(np.abs(values), 98.0))
     return -1.1 * limit, 1.1 * limit
 
@@ -243,18 +240,16 @@ def _figures(score: AgentScore) -> tuple[str, ...]:
 
 
 def _optimum(recipe: Recipe, scores: Sequence[AgentScore]) -> list[str]:
-    """For the linear task: the discounted optimum on the starts of the scores, E[s'Ps]."""
-    env = recipe.make_env()
-    if not isinstance(env.unwrapped, LinearTrackingEnv):
+    """For a linear plant: the discounted optimum on the starts of the scores, E[s'Ps]."""
+    env, plant = recipe.make_env(), PLANTS[recipe.task]
+    if plant.reference != "riccati":
         return []
-    from scipy.linalg import solve_discrete_are
+    from mpcoffline.plants.optimal import riccati
 
     from .collection import FIRST_START, starting_states
 
-    task, root = env.unwrapped, DISCOUNT**0.5
-    weights = (np.diag([9.0, 9.0, 1.0, 1.0]), np.diag([0.1, 0.1]))
-    P = solve_discrete_are(root * task.A, root * task.B, *weights)
-    s = starting_states(env, ["broad"] * scores[0].episodes, FIRST_START)
+    P = riccati(plant, **cast("ControlTask", env.unwrapped).parameters)
+    s = starting_states(env, [scores[0].start] * scores[0].episodes, FIRST_START)
     best = float(np.einsum("bi,ij,bj->b", s, P, s).mean())
     return [
         f"The optimum without input bounds (discounted Riccati equation) is Jd = {best:.2f} on these starts: the agent"

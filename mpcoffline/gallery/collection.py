@@ -47,7 +47,7 @@ def collect(
     sees scaled observations and a scaled reward. ``return_curve`` gives the return of each episode.
 
     Args:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         alpha: Size of the model error of the linear task's plant; the recipe's (1.0) by default.
         steps: Number of transitions; the recipe's (500 episodes of 100) by default.
         seed: Seed of the agent and its environment; the recipe's by default.

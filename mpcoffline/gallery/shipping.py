@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 from mpcoffline.datasets.recipes import Recipe
+from mpcoffline.datasets.store.manifest import write_manifest
 from mpcoffline.datasets.store.packed import pack
 
 from .cards import write_card
@@ -35,12 +35,4 @@ def make_shipped(task: str, folder: Path, *, progress: bool = True) -> list[Path
     packed = folder / f"{task}.h5"
     pack(dataset, packed)
     card = write_card(dataset, recipe, scores, folder)
-    return [packed, card, write_checksums(folder)]
-
-
-def write_checksums(folder: Path) -> Path:
-    """Writes the sha256 of every packed file of a folder, in the format of ``sha256sum``."""
-    sums = folder / "SHA256SUMS"
-    lines = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}\n" for file in sorted(folder.glob("*.h5"))]
-    sums.write_text("".join(lines), encoding="utf-8")
-    return sums
+    return [packed, card, write_manifest(folder, sorted(file.name for file in folder.glob("*.h5")))]

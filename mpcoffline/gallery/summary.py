@@ -14,11 +14,13 @@ from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.outputs import check_output, write_file
 from mpcoffline.core.tables import Table
 from mpcoffline.core.text import markdown
-from mpcoffline.datasets.checks import check_numbers
+from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.datasets.store.local import load_dataset, shipped_datasets
+from mpcoffline.datasets.store.local import shipped_datasets
+from mpcoffline.datasets.table.numbers import check_numbers
+from mpcoffline.envs import plant_of
 
-from .cards import PANELS, Axis, coverage_figure
+from .cards import Axis, coverage_figure, panels_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,11 +29,6 @@ if TYPE_CHECKING:
 
 QUANTILES = (0.0, 5.0, 50.0, 95.0, 100.0)
 _HEADER = ("", "smallest", "5 %", "median", "95 %", "largest", "mean")
-_TASK_OF = {
-    "mpcoffline/LinearTracking-v0": "linear",
-    "mpcoffline/PendulumSwingUp-v0": "pendulum",
-    "mpcoffline/CartPoleSwingUp-v0": "cartpole",
-}
 
 
 @dataclass(frozen=True)
@@ -134,9 +131,9 @@ def coverage(dataset: MinariDataset, columns: dict[str, NDArray[np.float64]] | N
         columns: As read by :func:`show`; read here if None.
     """
     data = columns if columns is not None else _columns(dataset)
-    task = _TASK_OF.get(dataset.env_spec.id) if dataset.env_spec is not None else None
-    if task is not None and "state" in data:
-        return coverage_figure(PANELS[task], data["state"], data["action"])
+    plant = plant_of(dataset.env_spec.id) if dataset.env_spec is not None else None
+    if plant is not None and "state" in data:
+        return coverage_figure(panels_of(plant), data["state"], data["action"])
     size = data["observation"].shape[1]
     axes = [Axis(f"observation [{i}]", "state", i) for i in range(size)]
     pairs = [(axes[i], axes[i + 1]) for i in range(0, min(size, 6) - 1, 2)]
@@ -195,6 +192,6 @@ def _statistics(name: str, values: NDArray[np.float64]) -> Statistics:
 
 
 def _card(dataset_id: str) -> str:
-    file = shipped_datasets().get(dataset_id)
-    card = catalog_file(file.replace(".h5", ".md")) if file is not None else None
+    task = shipped_datasets().get(dataset_id)
+    card = catalog_file(f"{task}.md", task) if task is not None else None
     return card.read_text(encoding="utf-8") if card is not None and card.is_file() else ""

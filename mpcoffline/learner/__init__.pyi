@@ -4,4 +4,3 @@ from .learner import OfflineMPCLearner as OfflineMPCLearner
 from .loggers import CSVLogger as CSVLogger
 from .loggers import TensorBoardLogger as TensorBoardLogger
 from .presets import PRESETS as PRESETS
-from .presets import LearnerConfig as LearnerConfig

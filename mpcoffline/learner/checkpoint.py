@@ -10,18 +10,19 @@ from mpcoffline.core.archive import file_errors, read_archive, write_archive
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.outputs import check_output
 from mpcoffline.core.text import check_name
+from mpcoffline.learning import METHODS
 
-from .fitting import Fit
+from .run import Run
 
 History = list[tuple[int, dict[str, float]]]
 
 
 class Checkpoint:
-    """A file with the state of a fit at the end of an epoch.
+    """A file with the state of a run at the end of an epoch.
 
     Args:
         path: Where.
-        identity: What decides the fit (data, MPC, configuration, seed), as one short text.
+        identity: What decides the fit (data, MPC, method, options, seed), as one short text.
 
     Raises:
         StorageError: If nothing could be written there.
@@ -31,16 +32,17 @@ class Checkpoint:
         check_output(path)
         self._path, self._identity = Path(path), identity
 
-    def resume(self, fit: Fit) -> History:
-        """Takes a fit to where the file says, if there is one; returns the history until then.
+    def resume(self, run: Run) -> History:
+        """Takes a run to where the file says, if there is one; returns the history until then.
 
         Raises:
             InvalidArgumentError: If the file is of another fit; it stays as it is.
-            FileFormatError: If it is damaged.
+            FileFormatError: If it is damaged, or of a learning method that is not known here.
         """
         if not self._path.exists():
             return []
         document, arrays = read_archive(self._path, "checkpoint")
+        METHODS.of_file(document.get("method"), str(self._path))
         with file_errors(self._path):
             identity = str(document["identity"])
             history = history_from_json(document["history"])
@@ -51,12 +53,13 @@ class Checkpoint:
                 actual=f"{self._path}, of another fit",
                 hint="Name another file, or delete this one.",
             )
-        fit.restore(arrays)
+        run.restore(arrays)
         return history
 
-    def write(self, fit: Fit, history: History) -> None:
+    def write(self, run: Run, history: History) -> None:
         """Replaces the file; an interruption leaves the old one."""
-        write_archive(self._path, "checkpoint", {"identity": self._identity, "history": history}, fit.to_arrays())
+        document = {"method": run.method.name, "identity": self._identity, "history": history}
+        write_archive(self._path, "checkpoint", document, run.to_arrays())
 
 
 def history_from_json(data: Any) -> History:

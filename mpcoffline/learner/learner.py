@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,12 +17,12 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning import FitResult, ValueFunction
+from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 
 from .checkpoint import Checkpoint, History, history_from_json
-from .fitting import Fit
-from .presets import PRESETS, LearnerConfig
+from .presets import PRESETS
+from .run import Run
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -60,46 +59,62 @@ class OfflineMPCLearner:
     Args:
         mpc: MPC_1: the nominal MPC. It is never changed.
         learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3).
-        preset: Name of a :class:`~mpcoffline.learner.LearnerConfig` in ``mpcoffline.learner.PRESETS``: ``"paper"`` is
-            the published recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon,
-            ``"best"`` the longest.
+        preset: Name of a learning method with options in ``mpcoffline.learner.PRESETS``: ``"paper"`` is the published
+            recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
+            longest. ``"default"`` where no method is given.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
-        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"`` or ``"auto"``; overrides the
-            preset.
+        method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
+            own options.
+        value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
+            ``mpcoffline.learning.VALUE_METHODS``, or a method itself; overrides the preset.
         value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
         device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
-        **overrides: Any field of :class:`~mpcoffline.learner.LearnerConfig`, ``ValueConfig`` or ``FitConfig``, e.g.
-            ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; names that two have take a prefix (``value_n_steps``,
-            ``fit_n_steps``).
+        **options: Any option of the method, e.g. ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; what two stages
+            have takes the name of the stage in front (``value_n_steps``, ``fit_n_steps``). ``learner.method.options``
+            has all of them.
 
     Raises:
-        UnknownIdError: For an unknown preset, value method or override.
-        InvalidArgumentError: For another ``learn``, or a value out of range.
+        UnknownIdError: For an unknown preset, learning method, value method or option.
+        InvalidArgumentError: For another ``learn``, a preset beside a method, or a value out of range.
+
+    Attributes:
+        method: The learning method with its options.
+        preset: The name of the preset; None where a method was given.
     """
 
     def __init__(
         self,
         mpc: MPC,
         learn: Learn = "cost+model",
-        preset: str = "default",
+        preset: str | None = None,
         seed: int = 0,
         *,
-        value: str | None = None,
+        method: str | Method | None = None,
+        value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
         device: str = "cpu",
-        **overrides: Any,
+        **options: Any,
     ) -> None:
         if not isinstance(learn, str) or learn not in _GROUPS:
             raise InvalidArgumentError("learn", expected="'cost' or 'cost+model'", actual=repr(learn))
-        check_known("preset", preset, PRESETS)
+        if method is not None and preset is not None:
+            raise InvalidArgumentError(
+                "preset", expected="none beside a method: a preset names its own", actual=f"{preset!r}"
+            )
+        if method is None:
+            preset = "default" if preset is None else preset
+            check_known("preset", preset, PRESETS)
+            method = PRESETS[preset]
+        elif not isinstance(method, Method):
+            method = METHODS[method]()
         if value is not None:
-            overrides["method"] = value
+            options["value"] = value
         check_integers(0, seed=seed)
         if value_function is not None and value_function.ny != mpc.nx:
             raise InvalidArgumentError(
                 "value_function", expected=f"a function of {mpc.nx} coordinates", actual=str(value_function.ny)
             )
-        self.config = PRESETS[preset].replaced(overrides)
+        self.method = method.replaced(options)
         self.nominal_mpc, self.learn, self.preset, self.seed, self.device = mpc, learn, preset, int(seed), device
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
@@ -111,7 +126,8 @@ class OfflineMPCLearner:
     def __repr__(self) -> str:
         """What it learns, how, and whether it has."""
         state = "fitted" if self.result is not None else "not fitted"
-        return f"{type(self).__name__}(learn={self.learn!r}, preset={self.preset!r}, seed={self.seed}; {state})"
+        how = f"method={type(self.method).__name__}" if self.preset is None else f"preset={self.preset!r}"
+        return f"{type(self).__name__}(learn={self.learn!r}, {how}, seed={self.seed}; {state})"
 
     def fit(
         self,
@@ -124,12 +140,12 @@ class OfflineMPCLearner:
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
     ) -> History:
-        """Learns V_phi, then theta.
+        """Learns, stage by stage: by all presets V_phi, then theta.
 
         Args:
             dataset: A Minari data set, the id of one, or a table of transitions.
-            n_steps: Gradient steps of (VALUE), by far the longest part; the configuration's by default.
-            n_steps_per_epoch: Steps between entries of the history; 500 in (VALUE) and 100 in (FIT) by default.
+            n_steps: Gradient steps of (VALUE), by far the longest part; the method's by default.
+            n_steps_per_epoch: Steps between entries of the history; by default 500 in (VALUE) and 100 in (FIT).
             evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
                 one of (FIT) on, when there is a policy: the one that would be handed out if the fit ended there.
             callbacks: Functions ``(learner, epoch, total_step)``, called at the end of each epoch; one that returns
@@ -176,37 +192,28 @@ class OfflineMPCLearner:
         """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
         for name in evaluators or {}:
             check_name("evaluator", name)
-        lengths: dict[str, int] = {}
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
-            lengths = {"value_epoch": n_steps_per_epoch, "fit_epoch": n_steps_per_epoch}
-        config = self.config if n_steps is None else self.config.replaced({"value_n_steps": n_steps})
+        method = self.method if n_steps is None else self.method.replaced({"value_n_steps": n_steps})
         table, observation_space = self._table(dataset)
-        fit = Fit(
-            self.nominal_mpc,
-            _GROUPS[self.learn],
-            config,
-            table,
-            seed=self.seed,
-            device=self.device,
-            value_function=self._given_value_function,
-        )
-        saved = None if checkpoint is None else Checkpoint(checkpoint, fit.identity)
-        history: History = [] if saved is None else saved.resume(fit)
+        known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
+        run = Run(method, known)
+        saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
+        history: History = [] if saved is None else saved.resume(run)
         with ExitStack() as ending, Bars(show_progress) as bars:
             for callback in callbacks:
                 if (end := getattr(callback, "on_fit_end", None)) is not None:
                     ending.callback(end)
-            for epoch in fit.epochs(**lengths):
-                self.value_function, self.result = fit.value_function, fit.result
-                self._mpc, self._policy, self._observation_space = fit.learned, None, observation_space
+            for epoch in run.epochs(n_steps_per_epoch):
+                self.value_function, self.result = run.value_function, run.result
+                self._mpc, self._policy, self._observation_space = run.learned, None, observation_space
                 metrics = dict(epoch.metrics)
-                if fit.learned is not None:
+                if run.learned is not None:
                     metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
                 history.append((len(history) + 1, metrics))
                 self.history = history
-                if saved is not None and fit.result is None:  # what comes last takes seconds and can be repeated
-                    saved.write(fit, history)
+                if saved is not None and run.result is None:  # what comes last takes seconds and can be repeated
+                    saved.write(run, history)
                 answers = [callback(self, len(history), epoch.total_step) for callback in callbacks]
                 shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
                 bars.show(epoch.phase, epoch.step, epoch.n_steps, shown)
@@ -261,17 +268,24 @@ class OfflineMPCLearner:
         return table, space if isinstance(space, spaces.Box) else None
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes nominal and learned MPC, value function, configuration and history to a zip of JSON and npz."""
+        """Writes nominal and learned MPC, value function, method and history to a zip of JSON and npz.
+
+        Raises:
+            InvalidArgumentError: For an MPC that has no JSON form, or a learning or value method that is not
+                registered; nothing is written then.
+            StorageError: If it cannot be written.
+        """
         space = self._observation_space
         document = {
             "nominal": self.nominal_mpc.to_json(),
             "learned": None if self._mpc is None else self.mpc.to_json(),
             "learn": self.learn,
             "preset": self.preset,
+            "method": self.method.name,
+            "options": self.method.to_json(),
             "value_given": self._given_value_function is not None,
             "seed": self.seed,
             "device": self.device,
-            "config": asdict(self.config),
             "history": self.history,
             "result": None if self.result is None else self.result.to_json(),
             "observation_space": None if space is None else box_to_json(space),
@@ -284,13 +298,17 @@ class OfflineMPCLearner:
         """Reads what :meth:`save` wrote.
 
         Raises:
-            FileFormatError: If the file is damaged, foreign or of another version.
+            FileFormatError: If the file is damaged, foreign, of another version, or of a learning method that is not
+                known here.
         """
         document, arrays = read_archive(path, "learner")
+        method = METHODS.of_file(document.get("method"), str(path))
         with file_errors(path):
             nominal = MPC.from_json(document["nominal"])
-            learner = cls(nominal, document["learn"], document["preset"], document["seed"], device=document["device"])
-            learner.config = LearnerConfig.from_json(document["config"])
+            how = method().replaced(document["options"])
+            learner = cls(nominal, document["learn"], seed=document["seed"], method=how, device=document["device"])
+            if document["preset"] is not None:
+                learner.preset = check_name("preset", document["preset"], error=FileFormatError)
             learner.history = history_from_json(document["history"])
             if document["learned"] is not None:
                 learner._mpc = MPC.from_json(document["learned"])

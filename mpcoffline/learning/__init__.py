@@ -1,22 +1,36 @@
-"""From data to theta by plain regression; no MPC is solved here (arXiv:2301.01667)."""
+"""From data to theta: learning methods, and the regressions that they are made of (arXiv:2301.01667)."""
 
 from __future__ import annotations
 
-from .bellman.regression import FitConfig, FitResult, ParameterTraining, fit_parameters
+from .bellman.method import Bellman
+from .bellman.regression import ParameterConfig, ParameterTraining, fit_parameters
+from .bellman.stages import StartConfig, TerminalConfig
+from .method import METHODS, Method
+from .paper import Paper
+from .stages import FitResult, Known, Stage
 from .terminal import DistillConfig, TerminalError, fit_terminal, terminal_error
-from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
+from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueMethod, ValueTraining, fit_value
 from .value.noise import Stochasticity, estimate_stochasticity
 
 __all__ = [
+    "METHODS",
     "VALUE_METHODS",
+    "Bellman",
     "DistillConfig",
-    "FitConfig",
     "FitResult",
+    "Known",
+    "Method",
+    "Paper",
+    "ParameterConfig",
     "ParameterTraining",
+    "Stage",
+    "StartConfig",
     "Stochasticity",
+    "TerminalConfig",
     "TerminalError",
     "ValueConfig",
     "ValueFunction",
+    "ValueMethod",
     "ValueTraining",
     "estimate_stochasticity",
     "fit_parameters",

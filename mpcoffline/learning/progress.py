@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 Metrics = dict[str, float]
 #: Called as ``report(steps_done, steps_total, metrics)`` at the end of each epoch.
-Report = Callable[[int, int, Metrics], None]
+OnEpoch = Callable[[int, int, Metrics], None]
 
 
 def silent(steps_done: int, steps_total: int, metrics: Metrics) -> None:

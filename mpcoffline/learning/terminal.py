@@ -25,7 +25,7 @@ from mpcoffline.mpc.networks import HIDDEN
 from .distillation import fit_network
 
 Array = NDArray[np.float64]
-Value = Callable[[Tensor], Tensor]
+StateFunction = Callable[[Tensor], Tensor]
 TerminalKind = Literal["quadratic", "network"]
 
 TERMINAL_KINDS = ("quadratic", "network")
@@ -78,7 +78,7 @@ class TerminalError:
 
 def fit_terminal(
     kind: TerminalKind,
-    value: Value,
+    value: StateFunction,
     observations: ArrayLike,
     *,
     x_ref: ArrayLike,
@@ -155,7 +155,7 @@ def fit_terminal(
     return with_network(1.0 - blend)
 
 
-def terminal_error(cost: TerminalCost, value: Value, observations: ArrayLike) -> TerminalError:
+def terminal_error(cost: TerminalCost, value: StateFunction, observations: ArrayLike) -> TerminalError:
     """How far a terminal cost is from V on some states.
 
     Args:
@@ -195,7 +195,7 @@ def _flat(states: Array) -> float:
     return _FLAT if _narrowed(states).dtype == np.float32 else _FLAT_DOUBLE
 
 
-def _values(value: Value, states: Array) -> Array:
+def _values(value: StateFunction, states: Array) -> Array:
     """V of states ``(n, nx)`` in float64, ``(n,)``."""
     with torch.no_grad():
         values = value(torch.from_numpy(_narrowed(states))).double().numpy()

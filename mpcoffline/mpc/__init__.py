@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from .component import StageCost, TerminalCost
-from .constraints import Constraint, Penalty, StateBounds
+from .component import COSTS, StageCost, TerminalCost
+from .constraints import CONSTRAINTS, AnyConstraint, Constraint, Penalty, StateBounds
 from .cost import NormCost, QuadraticCost
+from .expression_cost import ExpressionCost
 from .lifted import LiftedCost, polynomial_features
 from .model import Model
 from .networks import ConvexNetworkCost, NetworkCost
@@ -12,10 +13,14 @@ from .parameters import Block, Parameter, ParameterSpace
 from .problem import MPC
 
 __all__ = [
+    "CONSTRAINTS",
+    "COSTS",
     "MPC",
+    "AnyConstraint",
     "Block",
     "Constraint",
     "ConvexNetworkCost",
+    "ExpressionCost",
     "LiftedCost",
     "Model",
     "NetworkCost",

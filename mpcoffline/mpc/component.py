@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.registry import Registry
 
 from .parameters import Array, Block, Parameter, ParameterSpace
 
@@ -45,6 +46,19 @@ class Component:
         return {"kind": type(self).__name__, "blocks": [block.to_json() for block in self.space]}
 
 
+#: Costs whose kind files name. A cost that is not here is saved by its expression (:class:`ExpressionCost`).
+COSTS: Registry[type[Any]] = Registry("cost", Component, ("from_json", "expression|terminal_expression"))
+
+
+def cost_from_json(data: Mapping[str, Any]) -> Any:
+    """A stage or terminal cost from its JSON form.
+
+    Raises:
+        FileFormatError: For a kind of cost that nobody has registered.
+    """
+    return COSTS.of_file(data.get("kind"), "cost").from_json(data)
+
+
 class StageCost(Protocol):
     """The stage cost Lhat_theta(x, u) of (MPC).
 
@@ -60,9 +74,6 @@ class StageCost(Protocol):
     def with_theta(self, theta: Array) -> Self:
         """A copy with other parameter values."""
 
-    def to_json(self) -> dict[str, Any]:
-        """A JSON-able description."""
-
 
 class TerminalCost(Protocol):
     """The terminal cost T_theta(x) of (MPC); ``convex = True`` means the same as in :class:`StageCost`."""
@@ -74,9 +85,6 @@ class TerminalCost(Protocol):
 
     def with_theta(self, theta: Array) -> Self:
         """A copy with other parameter values."""
-
-    def to_json(self) -> dict[str, Any]:
-        """A JSON-able description."""
 
 
 def blocks_from_json(data: Mapping[str, Any]) -> ParameterSpace:

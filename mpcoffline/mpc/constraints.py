@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Self, cast
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.registry import Registry
 from mpcoffline.core.text import check_name
 
 from .expressions import function_from_json, function_to_json, traced
@@ -42,8 +44,28 @@ class Sizes(NamedTuple):
     parameters: ParameterSpace
 
 
+class AnyConstraint(ABC):
+    """What an MPC takes as a constraint: something that gives the two forms that solvers know.
+
+    An own one subclasses this, or one of the two forms.
+    """
+
+    @abstractmethod
+    def fitted(self, sizes: Sizes) -> Constraint | StateBounds:
+        """This constraint for an MPC of these sizes, in one of the forms that solvers know.
+
+        Raises:
+            InvalidArgumentError: If it does not fit them.
+        """
+
+
+#: Constraints whose kind files name. One that is not here is saved by its expression, as the form that solvers know.
+CONSTRAINTS: Registry[type[Any]] = Registry("constraint", AnyConstraint, ("to_json", "from_json"))
+
+
+@CONSTRAINTS.register("Constraint")
 @dataclass(frozen=True, eq=False)
-class Constraint:
+class Constraint(AnyConstraint):
     """h_theta(x, u) <= 0 of (MPC) at the stages 0 ... N - 1, or h_theta(x_N) <= 0.
 
     Args:
@@ -103,9 +125,25 @@ class Constraint:
             "function": function_to_json(cast(ca.Function, self.function)),
         }
 
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], sizes: Sizes) -> Self:
+        """The inverse of ``to_json``.
 
+        Raises:
+            FileFormatError: If the data are damaged.
+        """
+        if not isinstance(data["terminal"], bool):
+            raise FileFormatError("constraint", expected="terminal true or false", actual=repr(data["terminal"])[:80])
+        size = sizes.parameters.size
+        inputs = (sizes.nx, size) if data["terminal"] else (sizes.nx, sizes.nu, size)
+        # Not by its own name: CasADi takes no blanks in it.
+        function = function_from_json(data["function"], "constraint", inputs=inputs)
+        return cls(function, data["name"], _penalty_from_json(data["soft"]), data["terminal"])
+
+
+@CONSTRAINTS.register("StateBounds")
 @dataclass(frozen=True, eq=False)
-class StateBounds:
+class StateBounds(AnyConstraint):
     """Bounds low <= x_k <= high for k = 1 ... N; the initial state is given, so it is not asked.
 
     Args:
@@ -160,12 +198,18 @@ class StateBounds:
             "high": _finite_or_none(np.asarray(self.high)),
         }
 
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], sizes: Sizes) -> Self:
+        """The inverse of ``to_json``."""
+        low = [-np.inf if v is None else float(v) for v in data["low"]]
+        high = [np.inf if v is None else float(v) for v in data["high"]]
+        return cls(low, high, data["name"], _penalty_from_json(data["soft"]))
 
-AnyConstraint = Constraint | StateBounds
+
 Constraints = ConstraintFunction | AnyConstraint | Sequence[AnyConstraint]
 
 
-def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[AnyConstraint, ...] | None:
+def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[Constraint | StateBounds, ...] | None:
     """The constraints of an MPC as a tuple, checked against its sizes; None where there are none.
 
     Raises:
@@ -173,26 +217,47 @@ def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[AnyCons
     """
     if given is None:
         return None
-    if isinstance(given, Constraint | StateBounds):
+    if isinstance(given, AnyConstraint):
         given = (given,)
     elif callable(given):
         given = (Constraint(given),)
     elif not isinstance(given, Sequence):
         raise InvalidArgumentError("constraints", expected="constraints", actual=repr(given))
     for constraint in given:
-        if not isinstance(constraint, Constraint | StateBounds):
+        if not isinstance(constraint, AnyConstraint):
             raise InvalidArgumentError(
                 "constraints",
                 expected="a function (x, u, p) -> h, or a list of Constraint and StateBounds",
                 actual=f"a list with {constraint!r}",
             )
-    names = [constraint.name for constraint in given]
+    fitted = tuple(constraint.fitted(sizes) for constraint in given)
+    names = [constraint.name for constraint in fitted]
     if len(set(names)) < len(names):
         raise InvalidArgumentError("names of constraints", expected="unique names", actual=str(names))
-    return tuple(constraint.fitted(sizes) for constraint in given) or None
+    return fitted or None
 
 
-def constraints_from_json(data: Sequence[Mapping[str, Any]] | None, sizes: Sizes) -> tuple[AnyConstraint, ...] | None:
+def constraints_to_json(
+    constraints: Sequence[Constraint | StateBounds], *, portable: bool = False
+) -> list[dict[str, Any]]:
+    """Fitted constraints as their classes write them, or, where files cannot name a class, in the form of solvers.
+
+    Args:
+        constraints: What :func:`fitted_constraints` returned.
+        portable: Whether classes from outside this package are written in that form, too.
+    """
+    found = []
+    for constraint in constraints:
+        own: Any = constraint
+        name = (CONSTRAINTS.shared_name_of if portable else CONSTRAINTS.name_of)(type(constraint))
+        form = Constraint if isinstance(constraint, Constraint) else StateBounds
+        found.append(dict(own.to_json()) | {"kind": name} if name else form.to_json(own))
+    return found
+
+
+def constraints_from_json(
+    data: Sequence[Mapping[str, Any]] | None, sizes: Sizes
+) -> tuple[Constraint | StateBounds, ...] | None:
     """The inverse of ``to_json`` of each.
 
     Raises:
@@ -202,20 +267,11 @@ def constraints_from_json(data: Sequence[Mapping[str, Any]] | None, sizes: Sizes
         return None
     if not isinstance(data, list) or not data:
         raise FileFormatError("constraints", expected="a list of constraints, or null", actual=repr(data)[:200])
-    return tuple(_from_json(entry, sizes) for entry in data)
+    return tuple(CONSTRAINTS.of_file(entry["kind"], "constraint").from_json(entry, sizes) for entry in data)
 
 
-def _from_json(data: Mapping[str, Any], sizes: Sizes) -> AnyConstraint:
-    kind, name = data["kind"], data["name"]
-    soft = None if data["soft"] is None else Penalty(*map(float, data["soft"]))
-    if kind == "StateBounds":
-        low = [-np.inf if v is None else float(v) for v in data["low"]]
-        return StateBounds(low, [np.inf if v is None else float(v) for v in data["high"]], name, soft)
-    if kind != "Constraint" or not isinstance(data["terminal"], bool):
-        raise FileFormatError("constraint", expected="a Constraint or StateBounds", actual=repr(kind))
-    inputs = (sizes.nx, sizes.parameters.size) if data["terminal"] else (sizes.nx, sizes.nu, sizes.parameters.size)
-    # Not by its own name: CasADi takes no blanks in it.
-    return Constraint(function_from_json(data["function"], "constraint", inputs=inputs), name, soft, data["terminal"])
+def _penalty_from_json(data: Sequence[float] | None) -> Penalty | None:
+    return None if data is None else Penalty(*map(float, data))
 
 
 def _checked_penalty(name: str, penalty: Penalty | None) -> Penalty | None:

@@ -10,12 +10,13 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError
 
-from .component import Component, blocks_from_json, difference, numbers, vector
+from .component import COSTS, Component, blocks_from_json, difference, numbers, vector
 from .parameters import Array, Block, ParameterSpace
 
 
+@COSTS.register("QuadraticCost")
 class QuadraticCost(Component):
     """The quadratic cost (COST) of arXiv:2301.01667, optionally with a cross term.
 
@@ -125,6 +126,7 @@ class QuadraticCost(Component):
         return cost
 
 
+@COSTS.register("NormCost")
 class NormCost(Component):
     """The terminal cost (TERM) of arXiv:2301.01667: the 2-norm of the distance to the reference, not squared.
 
@@ -166,23 +168,6 @@ class NormCost(Component):
         cost.space = blocks_from_json(data)
         cost.nx = len(cost.values["x_ref"])
         return cost
-
-
-def cost_from_json(data: Mapping[str, Any]) -> Any:
-    """A stage or terminal cost from its JSON form.
-
-    Raises:
-        FileFormatError: For an unknown kind of cost.
-    """
-    from .lifted import LiftedCost  # these two build on this module
-    from .networks import ConvexNetworkCost, NetworkCost
-
-    classes: tuple[Any, ...] = (QuadraticCost, NormCost, NetworkCost, ConvexNetworkCost, LiftedCost)
-    kinds = {each.__name__: each for each in classes}
-    kind = data.get("kind")
-    if not isinstance(kind, str) or kind not in kinds:
-        raise FileFormatError("cost", expected=f"one of {', '.join(kinds)}", actual=repr(kind))
-    return kinds[kind].from_json(data)
 
 
 def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError
 
-from .component import vector
+from .component import COSTS, vector
 from .cost import QuadraticCost
 from .expressions import function_from_json, function_to_json, traced
 from .parameters import Block, ParameterSpace
@@ -23,6 +23,7 @@ from .parameters import Block, ParameterSpace
 Features = Callable[[ca.SX], ca.SX]
 
 
+@COSTS.register("LiftedCost")
 class LiftedCost(QuadraticCost):
     """The quadratic cost (COST) of arXiv:2301.01667 in features phi of the state.
 

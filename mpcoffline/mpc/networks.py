@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
 
-from .component import Component, blocks_from_json, difference, vector
+from .component import COSTS, Component, blocks_from_json, difference, vector
 from .cost import QuadraticCost
 from .parameters import Array, Block, Parameter, ParameterSpace
 
@@ -20,6 +20,7 @@ HIDDEN = (24, 24)  # widths that hold the value of a swing-up to a few percent
 _SMALL = 1e-3  # curvature that a convex network cost has by default besides the network's
 
 
+@COSTS.register("NetworkCost")
 class NetworkCost(Component):
     """A terminal cost that is a fully connected network, plus a quadratic one.
 
@@ -112,6 +113,7 @@ class NetworkCost(Component):
         return cost
 
 
+@COSTS.register("ConvexNetworkCost")
 class ConvexNetworkCost(QuadraticCost):
     """A stage cost that is an input-convex network in state and input, plus a quadratic cost.
 

@@ -174,6 +174,13 @@ class Block:
             return factor
         return ca.reshape(theta, columns, rows).T  # CasADi is column-major
 
+    def flat(self, matrix: ca.SX) -> ca.SX:
+        """The inverse of :meth:`symbolic`: coordinates ``(size, 1)``."""
+        if self.kind == "psd":
+            rows, columns = np.tril_indices(self.shape[0])
+            return ca.vertcat(*(matrix[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
+        return ca.vec(matrix.T)
+
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description; infinite bounds become null."""
         return {

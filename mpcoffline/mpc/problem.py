@@ -17,9 +17,17 @@ from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 
-from .component import StageCost, TerminalCost
-from .constraints import Constraint, Constraints, Sizes, StateBounds, constraints_from_json, fitted_constraints
-from .cost import cost_from_json
+from .component import StageCost, TerminalCost, cost_from_json
+from .constraints import (
+    Constraint,
+    Constraints,
+    Sizes,
+    StateBounds,
+    constraints_from_json,
+    constraints_to_json,
+    fitted_constraints,
+)
+from .expression_cost import cost_to_json
 from .expressions import traced
 from .model import Model
 from .parameters import Array, Group, ParameterSpace
@@ -229,14 +237,16 @@ class MPC:
 
     def constraints_at(self, place: Literal["stages", "end"]) -> list[Constraint]:
         """The constraints of the stages 0 ... N - 1, or of the end; state bounds are in neither."""
-        given = self.constraints if isinstance(self.constraints, tuple) else ()
-        return [c for c in given if isinstance(c, Constraint) and c.terminal == (place == "end")]
+        return [c for c in self._constraints if isinstance(c, Constraint) and c.terminal == (place == "end")]
 
     @property
     def state_bounds(self) -> list[StateBounds]:
         """The bounds of x_1 ... x_N."""
-        given = self.constraints if isinstance(self.constraints, tuple) else ()
-        return [c for c in given if isinstance(c, StateBounds)]
+        return [c for c in self._constraints if isinstance(c, StateBounds)]
+
+    @property
+    def _constraints(self) -> tuple[Constraint | StateBounds, ...]:
+        return self.constraints if isinstance(self.constraints, tuple) else ()
 
     def constraint_expression(self, constraint: Constraint) -> Callable[..., ca.SX]:
         """One of the constraints as ``(x, u, theta) -> h``, or ``(x, theta) -> h`` at the end."""
@@ -246,15 +256,28 @@ class MPC:
         size = sum(component.space.size for component in self._components().values())
         return ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu), ca.SX.sym("theta", size)
 
-    def to_json(self) -> dict[str, Any]:
-        """A JSON-able description from which :meth:`from_json` rebuilds the problem."""
-        constraints = self.constraints if isinstance(self.constraints, tuple) else None
-        return {name: component.to_json() for name, component in self._components().items()} | {
+    def to_json(self, *, portable: bool = False) -> dict[str, Any]:
+        """A JSON-able description from which :meth:`from_json` rebuilds the problem.
+
+        Costs of a class in ``mpcoffline.mpc.COSTS`` are written as their class says, others by their expression;
+        likewise constraints, in ``mpcoffline.mpc.CONSTRAINTS``.
+
+        Args:
+            portable: Whether classes from outside this package are written by their expression, too: then whoever
+                reads it, as another process, need not import them.
+
+        Raises:
+            InvalidArgumentError: For a function that is no plain arithmetic.
+        """
+        return {
+            "model": self.model.to_json(),
+            "stage_cost": cost_to_json(self.stage_cost, self.nx, self.nu, portable=portable),
+            "terminal_cost": cost_to_json(self.terminal_cost, self.nx, portable=portable),
             "horizon": self.horizon,
             "discount": self.discount,
             "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],
             "action_high": [_finite_or_none(v) for v in np.asarray(self.action_high)],
-            "constraints": None if constraints is None else [constraint.to_json() for constraint in constraints],
+            "constraints": constraints_to_json(self._constraints, portable=portable) or None,
         }
 
     @classmethod

@@ -1,41 +1,17 @@
-"""MPC_1 of each registered task: the nominal controller that learning starts from (arXiv:2301.01667)."""
+"""MPC_1 of each registered plant: the nominal controller that learning starts from (arXiv:2301.01667)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.envs import cartpole_swing_up as cartpole
-from mpcoffline.envs import linear_tracking as linear
-from mpcoffline.envs import pendulum_swing_up as pendulum
+from mpcoffline.envs import PLANTS, Plant
 from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
-
-
-class PhysicalParameter(NamedTuple):
-    """A parameter of a swing-up model: the plant's value, and the half-width of its error at alpha = 1."""
-
-    name: str
-    true: float
-    spread: float
-    unit: str
-
-
-PENDULUM_PARAMETERS = (
-    PhysicalParameter("m", pendulum.MASS, 0.5, "kg"),
-    PhysicalParameter("l", pendulum.LENGTH, 0.5, "m"),
-)
-CARTPOLE_PARAMETERS = (
-    PhysicalParameter("m_c", cartpole.CART_MASS, 0.1, "kg"),
-    PhysicalParameter("mu", cartpole.FRICTION, 0.25, "N s/m"),
-    PhysicalParameter("m_p", cartpole.POLE_MASS, 0.1, "kg"),
-    PhysicalParameter("l", cartpole.HALF_LENGTH, 0.25, "m"),
-)
 
 
 def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC:
@@ -53,113 +29,78 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
     The linear model of alpha = 0 is the plant's up to rounding.
 
     Args:
-        env_id: ``"mpcoffline/LinearTracking-v0"``, ``"mpcoffline/PendulumSwingUp-v0"`` or
-            ``"mpcoffline/CartPoleSwingUp-v0"``.
-        alpha: Size of the model error in the swing-up tasks: each parameter is off by alpha times a uniform draw.
-            The linear task takes none: there alpha changes the plant, and the model is that of alpha = 0.
+        env_id: Gymnasium id of a registered plant, e.g. ``"mpcoffline/PendulumSwingUp-v0"``.
+        alpha: Size of the model error: each parameter that has a spread is off by alpha times a uniform draw. Plants
+            without take none; there alpha changes the plant, and the model is that of alpha = 0.
         seed: Seeds the draws; one draw a parameter, so that the same seed scales with alpha.
 
     Returns:
-        The nominal MPC with the paper's horizon (100 linear, 50 otherwise), discount 0.9 and terminal cost (TERM).
+        The nominal MPC with the plant's horizon, discount 0.9 and terminal cost (TERM).
 
     Raises:
-        UnknownIdError: For an environment that is none of the three.
-        InvalidArgumentError: For an alpha that can make a mass or length non-positive, an alpha for the linear task,
+        UnknownIdError: For an environment of no registered plant.
+        InvalidArgumentError: For an alpha that can make a parameter non-positive, an alpha for a plant that takes none,
             or a negative seed.
     """
-    builders: dict[str, Callable[[float, int | None], MPC]] = {
-        "mpcoffline/LinearTracking-v0": _linear,
-        "mpcoffline/PendulumSwingUp-v0": _pendulum,
-        "mpcoffline/CartPoleSwingUp-v0": _cartpole,
-    }
+    by_id = {plant.id: plant for plant in PLANTS.values()}
     name = env_id.removeprefix("mpcoffline:") if isinstance(env_id, str) else env_id
-    check_known("environment id", name, builders)
+    check_known("environment id", name, by_id)
+    plant = by_id[name]
     if seed is not None:
         check_integers(0, seed=seed)
-    return builders[name](alpha, seed)
-
-
-def _linear(alpha: float, seed: int | None) -> MPC:
-    if alpha != 0.0:
-        raise InvalidArgumentError(
-            "alpha",
-            expected="none for the linear task, whose nominal model is fixed",
-            actual=str(alpha),
-            hint="Give alpha to the environment: gym.make('mpcoffline/LinearTracking-v0', alpha=...).",
-        )
-    model = Model(
-        lambda x, u, p: p["A"] @ x + p["B"] @ u,
-        nx=4,
-        nu=2,
-        dt=linear.LinearTrackingEnv.dt,
-        parameters={"A": linear.A0, "B": linear.B0},
-        discrete=True,
-    )
+    cost = plant.nominal
+    target = np.array(plant.lift([0.0] * len(plant.states), np.cos, np.sin))
     return MPC(
-        model=model,
-        stage_cost=QuadraticCost(linear.STATE_WEIGHT, linear.ACTION_WEIGHT),
-        terminal_cost=NormCost(np.zeros(4)),
-        horizon=100,
+        model=Model(
+            _dynamics(plant),
+            nx=len(plant.observations),
+            nu=len(plant.inputs),
+            dt=plant.dt,
+            parameters=_parameters(plant, alpha, seed),
+            discrete=plant.discrete,
+        ),
+        stage_cost=QuadraticCost(
+            np.diag(cost.weights), np.diag(cost.input_weights), x_ref=target, u_ref=cost.input_target
+        ),
+        terminal_cost=NormCost(target),
+        horizon=cost.horizon,
         discount=DISCOUNT,
-        action_low=[-linear.MAX_FORCE] * 2,
-        action_high=[linear.MAX_FORCE] * 2,
+        action_low=[c.low for c in plant.inputs],
+        action_high=[c.high for c in plant.inputs],
     )
 
 
-def _pendulum(alpha: float, seed: int | None) -> MPC:
+def _dynamics(plant: Plant) -> Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]:
+    """The plant's equations in the observation y, with the parameters that MPC_1 knows as numbers."""
+    known = {p.name: p.value for p in plant.parameters if p.spread is None}
+
     def ode(y: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
-        cos, sin, phid = y[0], y[1], y[2]
-        phidd = 1.5 * pendulum.GRAVITY / p["l"] * sin + 3.0 / (p["m"] * p["l"] ** 2) * u
-        return ca.vertcat(-phid * sin, phid * cos, phidd)
+        entries = ca.vertsplit(y)
+        rates = plant.dynamics(entries, ca.vertsplit(u), known | p)
+        column: ca.SX = ca.vertcat(*plant.lifted_rates(entries, rates))
+        return column
 
-    reference = [1.0, 0.0, 0.0]
-    return MPC(
-        model=Model(ode, 3, 1, pendulum.PendulumSwingUpEnv.dt, _perturbed(PENDULUM_PARAMETERS, alpha, seed)),
-        stage_cost=QuadraticCost(np.diag([1.0, 1.0, 0.1]), [[0.1]], x_ref=reference),
-        terminal_cost=NormCost(reference),
-        horizon=50,
-        discount=DISCOUNT,
-        action_low=[-pendulum.MAX_TORQUE],
-        action_high=[pendulum.MAX_TORQUE],
-    )
+    return ode
 
 
-def _cartpole(alpha: float, seed: int | None) -> MPC:
-    def ode(y: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
-        xd, cos, sin, phid = y[1], y[2], y[3], y[4]
-        mass, moment = p["m_c"] + p["m_p"], p["m_p"] * p["l"]
-        drive = p["mu"] * xd - u - moment * phid**2 * sin
-        # Dividing by |(cos, sin)|^2 changes nothing on the unit circle and keeps the inertia positive off it, where the
-        # iterates of an NLP solver wander.
-        inertia = p["l"] * (4.0 / 3.0 - p["m_p"] / mass * cos**2 / (cos**2 + sin**2))
-        phidd = (cartpole.GRAVITY * sin + cos * drive / mass) / inertia
-        xdd = (u - p["mu"] * xd + moment * (phid**2 * sin - phidd * cos)) / mass
-        return ca.vertcat(xd, xdd, -phid * sin, phid * cos, phidd)
-
-    reference = [0.0, 0.0, 1.0, 0.0, 0.0]
-    return MPC(
-        model=Model(ode, 5, 1, cartpole.CartPoleSwingUpEnv.dt, _perturbed(CARTPOLE_PARAMETERS, alpha, seed)),
-        stage_cost=QuadraticCost(np.diag([3.0, 0.01, 3.0, 1.0, 0.01]), [[0.001]], x_ref=reference),
-        terminal_cost=NormCost(reference),
-        horizon=50,
-        discount=DISCOUNT,
-        action_low=[-cartpole.MAX_FORCE],
-        action_high=[cartpole.MAX_FORCE],
-    )
-
-
-def _perturbed(parameters: tuple[PhysicalParameter, ...], alpha: float, seed: int | None) -> dict[str, Parameter]:
+def _parameters(plant: Plant, alpha: float, seed: int | None) -> dict[str, Parameter]:
     """The parameters with their errors; learning may move each from 1/100 to 100 times the plant's value."""
-    limit = min(parameter.true / parameter.spread for parameter in parameters)
-    if not 0.0 <= alpha < limit:
+    learned = [(p, np.asarray(p.value, np.float64)) for p in plant.parameters if p.spread is not None]
+    limit = min((float(value) / p.spread for p, value in learned if p.spread), default=0.0)
+    if limit == 0.0 and alpha != 0.0:
+        hint = f"Give alpha to the environment: gym.make({plant.id!r}, alpha=...)." if plant.max_alpha else ""
+        expected = f"none for the {plant.name} task, whose nominal model is fixed"
+        raise InvalidArgumentError("alpha", expected=expected, actual=str(alpha), hint=hint)
+    if limit and not 0.0 <= alpha < limit:
         raise InvalidArgumentError(
             "alpha",
             expected=f"a number from 0 to below {limit:g}, so that no mass or length can vanish",
             actual=str(alpha),
         )
-    draws = np.random.default_rng(seed).uniform(-1.0, 1.0, size=len(parameters))
-    values = [p.true + alpha * p.spread * draw for p, draw in zip(parameters, draws, strict=True)]
-    return {
-        p.name: Parameter(value, low=min(0.01 * p.true, value), high=100.0 * p.true, unit=p.unit)
-        for p, value in zip(parameters, values, strict=True)
-    }
+    draws = np.random.default_rng(seed).uniform(-1.0, 1.0, size=len(learned))
+    parameters = {}
+    for (p, true), draw in zip(learned, draws, strict=True):
+        value = true + alpha * p.spread * draw if p.spread else true
+        bounds = {"low": np.minimum(0.01 * true, value), "high": 100.0 * true} if p.spread else {}
+        parameters[p.name] = Parameter(value, unit=p.unit, **bounds)
+    return parameters

@@ -11,9 +11,10 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.envs import Plant
 from mpcoffline.mpc import MPC
 
-from .panels import TaskLabels, on_plane, task_of
+from .panels import on_plane, plane_of, task_of
 from .portrait import draw_levels, label_plane
 from .style import PAGE_WIDTH, controller_label, new_figure, paper_style
 
@@ -47,28 +48,29 @@ def cost_figure(
     Raises:
         InvalidArgumentError: For an environment that is none of this package's tasks, or MPCs of another one.
     """
-    task, labels = task_of(env)
+    task, plant = task_of(env)
+    plane = plane_of(plant)
     mpcs = (nominal, learned)
     for mpc in mpcs:
-        if (mpc.nx, mpc.nu) != (len(labels.observations), len(labels.actions)):
+        if (mpc.nx, mpc.nu) != (len(plant.observations), len(plant.inputs)):
             raise InvalidArgumentError(
                 "MPC",
-                expected=f"{len(labels.observations)} states and {len(labels.actions)} inputs, as in the environment",
+                expected=f"{len(plant.observations)} states and {len(plant.inputs)} inputs, as in the environment",
                 actual=f"{mpc.nx} and {mpc.nu}",
             )
     weights = [stage_weights(mpc) for mpc in mpcs]
-    landscapes = [on_plane(task, labels, partial(_stage_cost, mpc)) for mpc in mpcs]
+    landscapes = [on_plane(task, plane, partial(_stage_cost, mpc)) for mpc in mpcs]
     everything = np.stack([values for _, _, values in landscapes])
     span = float(everything.min()), float(everything.max())  # one colour bar for both
     with paper_style():
         figure = new_figure(PAGE_WIDTH, 4.6)
         panels = np.asarray(figure.subplots(2, 2, width_ratios=(1.0, 1.25)))
         for (left, right), name, weight, landscape in zip(panels, names, weights, landscapes, strict=True):
-            draw_weights(left, weight, _entries(labels))
+            draw_weights(left, weight, _entries(plant))
             left.set_title(f"weights of {controller_label(name)}")
             shades = draw_levels(right, landscape, span)
             right.set_title(f"stage cost of {controller_label(name)}, no input")
-            label_plane(right, labels)
+            label_plane(right, plane)
         figure.colorbar(shades, ax=panels[:, 1], pad=0.02, aspect=40, label="$\\hat L$")
     return figure
 
@@ -124,6 +126,6 @@ def _stage_cost(mpc: MPC, y: Array) -> Array:
     return np.asarray(mpc.stage_function(y.T, np.zeros((mpc.nu, len(y))), mpc.theta).full()[0])
 
 
-def _entries(labels: TaskLabels) -> list[str]:
+def _entries(plant: Plant) -> list[str]:
     """Names of the observations and the inputs, without units."""
-    return [*labels.observations, *(label[label.index("$") : label.rindex("$") + 1] for label in labels.actions)]
+    return [*plant.observations, *(f"${c.symbol}$" for c in plant.inputs)]

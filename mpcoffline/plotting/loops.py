@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from .panels import task_of
-from .signals import Signal, draw_signal
+from .signals import draw_signal, signals_of
 from .style import PAGE_WIDTH, legend_handles, new_figure, paper_style
 
 if TYPE_CHECKING:
@@ -34,16 +34,10 @@ def loop_figure(loops: Mapping[str, Evaluation], env: gym.Env[Any, Any] | str, e
     Raises:
         InvalidArgumentError: For an environment that is none of this package's tasks.
     """
-    task, labels = task_of(env)
+    task, plant = task_of(env)
     states = {name: loop.states[episode] for name, loop in loops.items()}
     actions = {name: loop.actions[episode] for name, loop in loops.items()}
-    signals = [
-        Signal(c.label, {name: s[:, c.index] for name, s in states.items()}, target=0.0, angle=c.angle, band=c.band)
-        for c in labels.states
-    ]
-    for i, label in enumerate(labels.actions):
-        bounds = (float(task.action_space.low[i]), float(task.action_space.high[i]))
-        signals.append(Signal(label, {name: a[:, i] for name, a in actions.items()}, bounds=bounds, held=True))
+    signals = signals_of(plant, states, actions)
     with paper_style():
         figure = new_figure(0.75 * PAGE_WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * len(signals))
         panels = np.atleast_1d(figure.subplots(len(signals), 1, sharex=True))
@@ -52,7 +46,7 @@ def loop_figure(loops: Mapping[str, Evaluation], env: gym.Env[Any, Any] | str, e
         figure.align_ylabels()
         panels[-1].set_xlabel("time (s)")
         length = task.dt * max(len(s) - 1 for s in states.values())
-        panels[-1].set_xlim(0.0, min(length, labels.seconds or length))
+        panels[-1].set_xlim(0.0, min(length, plant.seconds or length))
         handles, names = legend_handles(list(loops))
         figure.legend(handles, names, loc="outside upper center", ncols=len(names), handlelength=3.2)
     return figure

@@ -10,8 +10,9 @@ import gymnasium as gym
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.envs import State
 
-from .panels import Coordinate, Landscape, TaskLabels, in_pi, on_plane, task_of, unwrapped
+from .panels import Landscape, Plane, in_pi, on_plane, plane_of, task_of, unwrapped
 from .style import OTHER, PAGE_WIDTH, STYLES, legend_handles, line_of, new_figure, paper_style
 
 if TYPE_CHECKING:
@@ -48,9 +49,9 @@ def phase_portrait(
     Raises:
         InvalidArgumentError: For an environment that is none of this package's tasks.
     """
-    task, labels = task_of(env)
-    labels = replace(labels, plane=_around(labels, loops))
-    landscape = on_plane(task, labels, value)
+    task, plant = task_of(env)
+    plane = _around(plane_of(plant), loops)
+    landscape = on_plane(task, plane, value)
     with paper_style():
         figure = new_figure(0.75 * PAGE_WIDTH, 3.3)
         axes = figure.subplots()
@@ -58,9 +59,9 @@ def phase_portrait(
         figure.colorbar(shades, ax=axes, label=label, pad=0.02, aspect=30).outline.set_linewidth(0.6)
         for name, loop in loops.items():
             for states in loop.states:
-                _draw_trajectory(axes, states, labels, name)
-        _mark_target(axes, labels)
-        label_plane(axes, labels)
+                _draw_trajectory(axes, states, plane, name)
+        _mark_target(axes, plane)
+        label_plane(axes, plane)
         handles, names = legend_handles(list(loops))
         figure.legend(handles, names, loc="outside upper center", ncols=len(names), handlelength=3.2)
     return figure
@@ -90,26 +91,26 @@ def draw_levels(axes: Axes, landscape: Landscape, span: tuple[float, float] | No
     return shades
 
 
-def label_plane(axes: Axes, labels: TaskLabels) -> None:
+def label_plane(axes: Axes, plane: Plane) -> None:
     """Names the axes of a task's plane and sets their limits; angles in half turns."""
-    horizontal, vertical = labels.plane
+    horizontal, vertical = plane
     axes.set(xlabel=horizontal.label, ylabel=vertical.label, xlim=horizontal.span, ylim=vertical.span)
     if horizontal.angle:
         turns = half_turns(horizontal)
         axes.set_xticks([np.pi * k for k in turns], [in_pi(k) for k in turns])
 
 
-def half_turns(coordinate: Coordinate) -> range:
+def half_turns(coordinate: State) -> range:
     """The k for which k pi is in an angle's span."""
     low, high = coordinate.span
     return range(int(np.ceil(low / np.pi)), int(np.floor(high / np.pi)) + 1)
 
 
-def _around(labels: TaskLabels, loops: Mapping[str, Evaluation]) -> tuple[Coordinate, Coordinate]:
+def _around(plane: Plane, loops: Mapping[str, Evaluation]) -> Plane:
     """The plane, widened where trajectories leave it."""
-    trajectories = [_projected(states, labels) for loop in loops.values() for states in loop.states]
+    trajectories = [_projected(states, plane) for loop in loops.values() for states in loop.states]
     wide = []
-    for i, coordinate in enumerate(labels.plane):
+    for i, coordinate in enumerate(plane):
         low, high = coordinate.span
         margin = _MARGIN * (high - low)
         visited = np.concatenate([trajectory[i] for trajectory in trajectories])
@@ -118,24 +119,24 @@ def _around(labels: TaskLabels, loops: Mapping[str, Evaluation]) -> tuple[Coordi
     return wide[0], wide[1]
 
 
-def _projected(states: Array, labels: TaskLabels) -> tuple[Array, Array]:
+def _projected(states: Array, plane: Plane) -> tuple[Array, Array]:
     """A trajectory ``(T, nx)`` in the plane, angles without jumps."""
-    x, y = (unwrapped(states[:, c.index]) if c.angle else states[:, c.index] for c in labels.plane)
+    x, y = (unwrapped(states[:, c.index]) if c.angle else states[:, c.index] for c in plane)
     return x, y
 
 
-def _draw_trajectory(axes: Axes, states: Array, labels: TaskLabels, name: str) -> None:
+def _draw_trajectory(axes: Axes, states: Array, plane: Plane, name: str) -> None:
     from matplotlib.patheffects import Normal, Stroke
 
-    x, y = _projected(states, labels)
+    x, y = _projected(states, plane)
     style = STYLES.get(name, OTHER)
     halo = [Stroke(linewidth=style.width + 1.4, foreground="white"), Normal()]
     axes.plot(x, y, **line_of(style), path_effects=halo, zorder=3)
     axes.plot(x[0], y[0], "o", color="white", markeredgecolor="black", markersize=4.5, markeredgewidth=0.8, zorder=4)
 
 
-def _mark_target(axes: Axes, labels: TaskLabels) -> None:
-    horizontal = labels.plane[0]
+def _mark_target(axes: Axes, plane: Plane) -> None:
+    horizontal = plane[0]
     places = [np.pi * k for k in half_turns(horizontal) if k % 2 == 0] if horizontal.angle else [0.0]
     for place in places:
         axes.plot(place, 0.0, "*", color="white", markeredgecolor="black", markersize=10, markeredgewidth=0.7, zorder=5)

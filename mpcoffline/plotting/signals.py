@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.envs import Plant
 
 from .panels import in_pi, unwrapped
 from .style import BOUND, OTHER, STYLES, controller_label, line_of
@@ -38,6 +39,25 @@ class Signal:
     held: bool = False
     angle: bool = False
     band: float | None = None
+
+
+def signals_of(plant: Plant, states: Mapping[str, Array], actions: Mapping[str, Array]) -> list[Signal]:
+    """What figures show of closed loops: states with their targets, inputs with their bounds.
+
+    Args:
+        plant: The plant.
+        states: One trajectory a controller, each ``(T + 1, nx)``.
+        actions: Likewise, each ``(T, nu)``.
+    """
+    shown = [
+        Signal(c.label, {name: s[:, c.index] for name, s in states.items()}, target=0.0, angle=c.angle, band=c.band)
+        for c in map(plant.state, plant.shown)
+    ]
+    inputs = [
+        Signal(c.label, {name: a[:, c.index] for name, a in actions.items()}, bounds=(c.low, c.high), held=True)
+        for c in plant.inputs
+    ]
+    return shown + inputs
 
 
 def draw_signal(axes: Axes, signal: Signal, dt: float) -> None:

@@ -94,8 +94,7 @@ def simulate(
 def initial_states(table: TransitionTable, count: int, seed: int) -> Array:
     """Where the log's own episodes began, at random; further states of the log where there are too few episodes."""
     rng = np.random.default_rng(seed)
-    _, firsts = np.unique(table.episode_ids, return_index=True)
-    chosen = rng.permutation(firsts)[:count]
+    chosen = rng.permutation(table.episodes.firsts)[:count]
     if len(chosen) < count:
         chosen = np.concatenate([chosen, rng.integers(len(table), size=count - len(chosen))])
     return np.asarray(table.take(np.sort(chosen)).observations, dtype=np.float64)

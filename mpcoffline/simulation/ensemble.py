@@ -10,7 +10,7 @@ import torch
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import Identification, OneStepProblem, Steps, without_jumps
+from mpcoffline.estimation.identification import Identification, OneStepProblem, Transitions, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
@@ -98,23 +98,23 @@ class _Episodes:
 
     def __init__(self, table: TransitionTable) -> None:
         self._n_rows = len(table)
-        ids, self._first, self._length = np.unique(table.episode_ids, return_index=True, return_counts=True)
+        ids, self._first, self._length = table.episodes
         if len(ids) < _FEW_EPISODES:
             self._first, self._length = np.arange(len(table)), np.ones(len(table), dtype=np.int64)
 
-    def resampled(self, rows: Steps, rng: np.random.Generator) -> Steps:
+    def resampled(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
         """As many rows as there are, or some thousand."""
         wanted = min(self._n_rows, _BOOTSTRAP_ROWS)
         drawn = rng.integers(len(self._first), size=1 + int(2 * wanted / self._length.mean()))
         pieces = [np.arange(self._first[k], self._first[k] + self._length[k]) for k in drawn]
         chosen = np.concatenate(pieces)[:wanted]
-        return Steps(*(part[chosen] for part in rows))
+        return Transitions(*(part[chosen] for part in rows))
 
 
 def _problem_of(mpc: MPC, table: TransitionTable, identification: Identification) -> OneStepProblem:
     """One-step prediction on the whole table, wrapped angles without jumps."""
     columns = table.values()
-    rows = Steps(columns.observations, columns.actions, columns.next_observations)
+    rows = Transitions(columns.observations, columns.actions, columns.next_observations)
     centre = table.centring.centre[: table.ny]
     problem = OneStepProblem(mpc, rows, centre)
     if not identification.unwrapped:

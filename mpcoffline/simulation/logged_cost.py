@@ -69,6 +69,5 @@ def _rows_split(table: TransitionTable, rng: np.random.Generator) -> tuple[Trans
 
 def _sample(table: TransitionTable, rng: np.random.Generator) -> tuple[Array, Array]:
     """Some rows as (s, a) and cost in float64."""
-    rows = np.sort(rng.permutation(len(table))[:_ROWS])
-    columns = table.take(rows).values()
+    columns = table.sample(_ROWS, rng).values()
     return np.hstack([columns.observations, columns.actions]), columns.costs

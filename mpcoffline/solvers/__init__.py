@@ -13,10 +13,11 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .ddp import CompilerError, DDPSolver
-from .interface import Plan, Solution, Solver
+from .interface import SOLVERS, Plan, Solution, Solver
 from .ipopt.solver import IpoptSolver
 from .lqr import LQRSolver
 from .options import check_options
+from .status import Stats, Status
 
 __all__ = [
     "SOLVERS",
@@ -27,13 +28,12 @@ __all__ = [
     "Plan",
     "Solution",
     "Solver",
+    "Stats",
+    "Status",
     "make_solver",
 ]
 
 logger = logging.getLogger(__name__)
-
-# In the order in which "auto" tries them: the fastest first.
-SOLVERS: dict[str, type[Solver]] = {"lqr": LQRSolver, "ddp": DDPSolver, "ipopt": IpoptSolver}
 
 
 def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
@@ -42,11 +42,11 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
     Args:
         mpc: The problem.
         name: ``"lqr"`` (linear model, quadratic costs, input bounds: exact), ``"ddp"`` (input bounds only; generated C,
-            hundreds of times faster than ipopt), ``"ipopt"`` (any smooth problem), or ``"auto"`` for the fastest that
-            supports the problem and has the options given; its ``reason`` and the log say why not a faster one. The
-            choice rests on the problem's structure alone, not on how solves go: that depends on states that nobody
-            knows yet, and changing over would be hundreds of times slower unasked. Where ddp often fails, name ipopt,
-            or give the policy ``rescue="ipopt"``.
+            hundreds of times faster than ipopt), ``"ipopt"`` (any smooth problem), any other in
+            ``mpcoffline.solvers.SOLVERS``, or ``"auto"`` for the fastest that takes the problem and has the options
+            given; its ``reason`` and the log say why not a faster one. The choice rests on the problem's structure
+            alone, not on how solves go: that depends on states that nobody knows yet, and changing over would be
+            hundreds of times slower unasked. Where ddp often fails, name ipopt, or give the policy ``rescue="ipopt"``.
         **options: Options of that solver's constructor.
 
     Returns:
@@ -55,7 +55,7 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
     Raises:
         UnknownIdError: For an unknown name.
         InvalidArgumentError: If the solver named does not support the problem, or for an option that it has not.
-        CompilerError: If ``"ddp"`` is named and there is no working C compiler; ``"auto"`` warns and takes ipopt.
+        CompilerError: If ``"ddp"`` is named and there is no working C compiler; ``"auto"`` warns and takes another.
     """
     check_solver(name, options)
     return _fastest(mpc, options) if name == "auto" else SOLVERS[name](mpc, **options)
@@ -73,7 +73,8 @@ def check_solver(name: str, options: Mapping[str, Any]) -> None:
         InvalidArgumentError: For an option that the solver has not, or a value out of range.
     """
     check_known("solver", name, ["auto", *SOLVERS])
-    known = _options(name) if name != "auto" else sorted({option for each in SOLVERS for option in _options(each)})
+    kinds = [kind for each, kind in SOLVERS.items() if name in (each, "auto")]
+    known = sorted({option for kind in kinds for option in _defaults(kind)})
     if unknown := [option for option in options if option not in known]:
         kind = "the solvers" if name == "auto" else f"the {name} solver"
         raise InvalidArgumentError(
@@ -82,27 +83,35 @@ def check_solver(name: str, options: Mapping[str, Any]) -> None:
     check_options(options)
 
 
+def changed_options(solver: Solver) -> dict[str, Any]:
+    """The options with which a solver was made, as far as they are not its class's defaults."""
+    defaults = _defaults(type(solver))
+    return {name: value for name, value in solver.options.items() if name not in defaults or value != defaults[name]}
+
+
 def _fastest(mpc: MPC, options: dict[str, Any]) -> Solver:
-    """The first of :data:`SOLVERS` that supports the problem."""
+    """The first of :data:`SOLVERS` that takes the problem, by their ``relative_speed``."""
     refusals: list[str] = []
-    no_compiler = ""
-    for name, solver_class in SOLVERS.items():
-        if unknown := _unknown_options(name, options):
+    lost: tuple[type[Solver], str] | None = None  # a faster one that there is no compiler for
+    for name, kind in sorted(SOLVERS.items(), key=lambda item: -item[1].relative_speed):
+        known = _defaults(kind)
+        given = {o: value for o, value in options.items() if o in known or lost is None or o not in _defaults(lost[0])}
+        if unknown := [option for option in given if option not in known]:
             refusals.append(f"{name} has no option {', '.join(unknown)}")
             continue
         try:
-            solver = solver_class(mpc, **options)
+            solver = kind(mpc, **given)
         except CompilerError as error:
-            no_compiler = str(error)
+            lost = kind, f"{name}: {error}"
             refusals.append(f"{name} has no compiler")
-            options = {key: value for key, value in options.items() if key in _options("ipopt")}
         except InvalidArgumentError as error:
-            if error.name in options or name == "ipopt":
+            if error.name in options:
                 raise
             refusals.append(f"{name} does not support {error.actual}")
         else:
-            if no_compiler and name == "ipopt":  # the warnings module shows the same text once
-                text = f"Solving with ipopt, which is about 500 times slower than ddp: {no_compiler}"
+            if lost is not None:  # the warnings module shows the same text once
+                slower = lost[0].relative_speed / kind.relative_speed
+                text = f"Solving with {name}, which is about {slower:.0f} times slower than {lost[1]}"
                 warnings.warn(text, stacklevel=3)
             solver.reason = f"{name} is the fastest that fits" + "".join(f"; {refusal}" for refusal in refusals)
             logger.info("Solver: %s.", solver.reason)
@@ -110,11 +119,7 @@ def _fastest(mpc: MPC, options: dict[str, Any]) -> Solver:
     raise InvalidArgumentError("options", expected="options of one solver", actual="; ".join(refusals))
 
 
-def _options(name: str) -> list[str]:
-    """The options of a solver's constructor."""
-    parameters = inspect.signature(SOLVERS[name].__init__).parameters.values()
-    return [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
-
-
-def _unknown_options(name: str, options: dict[str, Any]) -> list[str]:
-    return [option for option in options if option not in _options(name)]
+def _defaults(kind: type[Solver]) -> dict[str, Any]:
+    """The options of a solver's constructor, and their defaults."""
+    parameters = inspect.signature(kind.__init__).parameters.values()
+    return {parameter.name: parameter.default for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY}

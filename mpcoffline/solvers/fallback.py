@@ -149,11 +149,11 @@ class Fallback:
         self.stats.n_failures += len(rows)
         states, before = x[rows], Plan(warm_start.x[rows], warm_start.u[rows])
         found = _Found(solver, states, Plan(solution.x[rows].copy(), solution.u[rows].copy()), solution.value[rows])
-        reasons = np.array([solution.status[i] for i in rows])
+        reasons = np.array(solution.words)[rows]
         tried = np.broadcast_to(solution.stats.get("all_starts", False), len(x))[rows]
         retried = found.improve(before.known & ~tried, lambda some: self._solve(solver, states[some], None))
         rescued = np.zeros_like(retried)
-        if self.rescue is not None and solver.name != IpoptSolver.name:
+        if self.rescue is not None and not isinstance(solver, IpoptSolver):
             rescued = found.improve(~retried, lambda some: self._solve(self._oracle, states[some], found.part(some)))
         best = found.usable
         if solver.constrained:

@@ -6,14 +6,18 @@ import math
 import os
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC
+
+from .status import Stats, Status
 
 Array = NDArray[np.float64]
 
@@ -70,10 +74,8 @@ class Solution:
         value: V_theta(s), or Q_theta(s, a) where ``u0`` was given, ``(B,)``.
         success: Whether the trajectory was checked to be a solution, whatever the algorithm said of itself: it obeys
             model, bounds and constraints, and the conditions of an optimum hold. ``(B,)``
-        status: In words, one a problem: how it was solved, or what is wrong (e.g. the constraint that is violated).
-        stats: Figures of the call: ``iterations`` ``(B,)``, ``time`` in s, and what the solver adds, e.g. the
-            ``residual`` ``(B,)`` of the conditions of an optimum, or ``all_starts``, whether problems that failed were
-            tried from all starts.
+        status: How each solve ended, one a problem.
+        stats: Figures of the call, as ``stats["iterations"]``.
     """
 
     u0: Array
@@ -81,17 +83,22 @@ class Solution:
     u: Array = field(repr=False)
     value: Array
     success: NDArray[np.bool_]
-    status: list[str] = field(repr=False)
-    stats: dict[str, Any] = field(repr=False)
+    status: list[Status] = field(repr=False)
+    stats: Stats = field(repr=False)
 
     @property
     def plan(self) -> Plan:
         """The trajectories, for the next call's ``warm_start``."""
         return Plan(self.x, self.u) if self.x.ndim == 3 else Plan(self.x[None], self.u[None])
 
+    @property
+    def words(self) -> Sequence[str]:
+        """For people, one text a problem: how it was solved, or what is wrong, as the constraint that is violated."""
+        return self.stats.get("words", self.status)
+
     def unbatched(self) -> Solution:
         """The solution of the only problem, without the batch dimension."""
-        stats = {k: v[0] if isinstance(v, np.ndarray) else v for k, v in self.stats.items()}
+        stats = cast(Stats, {k: v[0] if isinstance(v, np.ndarray) else v for k, v in self.stats.items()})
         return Solution(self.u0[0], self.x[0], self.u[0], self.value[0], self.success[0], self.status, stats)
 
 
@@ -121,22 +128,45 @@ class Solver(ABC):
 
     Args:
         mpc: The problem. Its parameters are the default ``theta``; another theta never rebuilds the solver.
-        **options: With which a subclass was made, to be made again in another process.
+        **options: With which a subclass was made, to be made again in another process or from a file.
 
     Attributes:
         mpc: The problem.
-        name: What :func:`mpcoffline.make_solver` calls it.
+        options: As given.
         theta_dimensions: Which forms of theta it takes: 1 ``(size,)``, 2 ``(B, size)``, 3 ``(B, N + 1, size)``.
+        relative_speed: How many problems it solves while ipopt solves one, roughly, where nothing makes it hard.
+        needs_compiler: Whether making it raises :class:`~mpcoffline.solvers.CompilerError` without a C compiler.
         reason: Why :func:`mpcoffline.make_solver` chose it; empty where it was named.
+
+    Raises:
+        InvalidArgumentError: For a problem that :meth:`refuses` names a reason against.
     """
 
-    name: str
+    relative_speed: ClassVar[float] = 1.0
+    needs_compiler: ClassVar[bool] = False
     theta_dimensions: ClassVar[tuple[int, ...]] = (1,)
     reason: str = ""
 
     def __init__(self, mpc: MPC, **options: Any) -> None:
-        self.mpc, self._made_with = mpc, options
+        if reason := self.refuses(mpc):
+            raise InvalidArgumentError(
+                "mpc",
+                expected=f"a problem that the {self.name} solver takes",
+                actual=reason,
+                hint='Use make_solver(mpc, "auto").',
+            )
+        self.mpc, self.options = mpc, options
         self._theta = mpc.theta
+
+    @classmethod
+    def refuses(cls, mpc: MPC) -> str:
+        """Why it does not take a problem, e.g. ``"constraints"``; empty where it does. Nothing is built for it."""
+        return ""
+
+    @property
+    def name(self) -> str:
+        """What :func:`mpcoffline.make_solver` and files call it; its class's name where it is not registered."""
+        return SOLVERS.name_of(type(self)) or type(self).__name__
 
     def __copy__(self) -> Self:
         """The solver itself."""
@@ -152,11 +182,8 @@ class Solver(ABC):
         Raises:
             InvalidArgumentError: For an MPC that cannot be written to JSON.
         """
-        try:
-            document = self.mpc.to_json()
-        except AttributeError as error:  # an own cost
-            raise InvalidArgumentError("mpc", expected="one that has a JSON form", actual=str(error)) from error
-        return _made_again, (type(self), document, self._made_with), {"reason": self.reason}
+        document = self.mpc.to_json(portable=True)
+        return _made_again, (type(self), document, self.options), {"reason": self.reason}
 
     def __repr__(self) -> str:
         """Its class and the sizes of its problem."""
@@ -267,6 +294,10 @@ class Solver(ABC):
         if ((inputs < low - below) | (inputs > high + above)).any():
             raise InvalidArgumentError("u0", expected=f"inputs from {low} to {high}", actual=str(inputs))
         return np.clip(inputs, low, high)
+
+
+#: All solvers by name.
+SOLVERS: Registry[type[Solver]] = Registry("solver", Solver)
 
 
 def _made_again(kind: type[Solver], document: dict[str, Any], options: dict[str, Any]) -> Solver:

@@ -21,8 +21,8 @@ _TOUCHING = 1e-9  # distance from a bound that counts as none, relative to 1 + |
 _SINGULAR = 1e-13  # of a Hessian's diagonal, below which a pivot counts as zero
 
 
-def misfit(mpc: MPC) -> str | None:
-    """What keeps a problem from being linear-quadratic, or None."""
+def misfit(mpc: MPC) -> str:
+    """What keeps a problem from being linear-quadratic; empty where nothing does."""
     if mpc.constraints is not None:
         return "constraints other than input bounds"
     if not is_affine(mpc):
@@ -33,7 +33,7 @@ def misfit(mpc: MPC) -> str | None:
         hessian, _ = ca.hessian(cost, z)
         if ca.depends_on(hessian, z):
             return f"a {name} cost that is not quadratic ({type(getattr(mpc, f'{name}_cost')).__name__})"
-    return None
+    return ""
 
 
 def is_affine(mpc: MPC) -> bool:
@@ -155,7 +155,7 @@ class LinearQuadratic:
 
 
 class Extraction:
-    """Reads the matrices of an MPC whose :func:`misfit` is None, for any theta.
+    """Reads the matrices of an MPC whose :func:`misfit` is empty, for any theta.
 
     Args:
         mpc: The problem.

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from typing import Any
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers
-from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
-from .interface import Array, OneAtATime, Plan, Solution, Solver
+from .interface import SOLVERS, Array, OneAtATime, Plan, Solution, Solver
 from .ipopt.solver import IpoptSolver
 from .linear_quadratic import Extraction, LinearQuadratic, Riccati, misfit
+from .status import Stats, Status
 
 _TOLERANCE = 1e-8
 _INFINITE = 1e30  # daqp's
@@ -25,6 +24,7 @@ _SETTINGS = {"primal_tol": 1e-11, "dual_tol": 1e-12, "iter_limit": 10_000}
 _REASONS = {-1: "infeasible", -2: "cycling", -3: "unbounded", -4: "iteration limit", -5: "not convex"}
 
 
+@SOLVERS.register("lqr")
 class LQRSolver(Solver):
     """The exact solution of linear-quadratic problems, in numpy.
 
@@ -53,18 +53,11 @@ class LQRSolver(Solver):
         InvalidArgumentError: For another structure; the message says what does not fit.
     """
 
-    name = "lqr"
+    relative_speed = 2000.0
     theta_dimensions = (1, 2, 3)
 
     def __init__(self, mpc: MPC, *, cache_size: int = 8) -> None:
         super().__init__(mpc, cache_size=cache_size)
-        if (reason := misfit(mpc)) is not None:
-            raise InvalidArgumentError(
-                "mpc",
-                expected="a linear-quadratic problem for the lqr solver",
-                actual=reason,
-                hint='Use make_solver(mpc, "auto").',
-            )
         check_integers(1, cache_size=cache_size)
         self._extraction = Extraction(mpc)
         self._low, self._high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
@@ -73,6 +66,11 @@ class LQRSolver(Solver):
         self._ipopt: IpoptSolver | None = None
         self._alone = OneAtATime()
 
+    @classmethod
+    def refuses(cls, mpc: MPC) -> str:
+        """See :meth:`Solver.refuses`."""
+        return misfit(mpc)
+
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
         with self._alone:  # daqp works in memory that a solver has once
@@ -80,7 +78,7 @@ class LQRSolver(Solver):
                 solution = self._solve_with(theta, x, u0, warm_start)
             else:
                 solution = self._solve_each(theta, x, u0, warm_start)
-        solution.stats.update(time=time.perf_counter() - start, all_starts=True)
+        solution.stats["time"], solution.stats["all_starts"] = time.perf_counter() - start, True
         return solution
 
     def _solve_each(self, theta: Array, x: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
@@ -102,7 +100,7 @@ class LQRSolver(Solver):
         lost = np.flatnonzero(~solution.success)
         if len(lost):
             warm = _part(warm_start, lost)
-            reason = solution.status[lost[0]]
+            reason = solution.words[lost[0]]
             _put(solution, lost, self._by_ipopt(theta, x[lost], None if u0 is None else u0[lost], warm, reason))
         return solution
 
@@ -111,7 +109,7 @@ class LQRSolver(Solver):
             self._ipopt = IpoptSolver(self.mpc)
         every = theta if theta.ndim == 1 else theta[None]
         solution = self._ipopt.solve(x, every, u0, warm_start)
-        solution.status[:] = [f"ipopt, as {reason}: {status}" for status in solution.status]
+        solution.stats["words"] = [f"ipopt, as {reason}: {words}" for words in solution.words]
         return solution
 
     def _controller(self, theta: Array) -> _Controller:
@@ -151,20 +149,21 @@ class _Controller:
         begin = x if u0 is None else x @ problem.A[0].T + u0 @ problem.B[0].T + problem.c[0]
         states, inputs = riccati.trajectories(begin)
         value, residual = riccati.value(begin), riccati.residual(begin)
-        iterations, status = np.zeros(len(x), dtype=np.int64), ["Riccati"] * len(x)
+        iterations, words = np.zeros(len(x), dtype=np.int64), ["Riccati"] * len(x)
         rows = np.flatnonzero(((inputs < self._low) | (inputs > self._high)).any(axis=(1, 2)))
         if len(rows):
             program, rest = self._program(imposed, riccati), riccati.problem
             for i in rows:
                 guess = None if warm_start is None else warm_start.u[i, skipped:]
-                inputs[i], iterations[i], status[i] = program.solve(inputs[i], guess)
+                inputs[i], iterations[i], words[i] = program.solve(inputs[i], guess)
             states[rows] = rest.rollout(begin[rows], inputs[rows])
             bounded = states[rows], inputs[rows]
             value[rows] = rest.cost(*bounded)
             residual[rows] = rest.optimality(*bounded, rest.costates(*bounded), self._low, self._high)
         success = np.isfinite(value) & (residual <= _TOLERANCE)
+        status = [Status.CONVERGED] * len(x)
         for i in np.flatnonzero(~success):
-            status[i] = f"{status[i]} left a residual of {residual[i]:.1e}"
+            status[i], words[i] = Status.NOT_OPTIMAL, f"{words[i]} left a residual of {residual[i]:.1e}"
         if u0 is not None:
             z = np.concatenate([x, u0], axis=1)
             stage = np.einsum("bi,ij,bj->b", z, problem.H[0], z) + 2.0 * z @ problem.h[0] + problem.offset[0]
@@ -173,7 +172,7 @@ class _Controller:
             inputs = np.concatenate([u0[:, None], inputs], axis=1)
         else:
             states[:, 0] = x
-        stats: dict[str, Any] = {"iterations": iterations, "residual": residual}
+        stats: Stats = {"iterations": iterations, "time": 0.0, "residual": residual, "words": words}
         return Solution(inputs[:, 0].copy(), states, inputs, value, success, status, stats)
 
     def _program(self, imposed: bool, riccati: Riccati) -> _BoundedInputs:
@@ -202,7 +201,7 @@ class _BoundedInputs:
         self._model.setup(*self._data)
 
     def solve(self, u: Array, guess: Array | None) -> tuple[Array, int, str]:
-        """The best inputs within the bounds ``(N, nu)``, iterations and status.
+        """The best inputs within the bounds ``(N, nu)``, iterations, and how it went.
 
         Args:
             u: The inputs without bounds, ``(N, nu)``.
@@ -231,16 +230,17 @@ def _part(plan: Plan | None, rows: NDArray[np.intp]) -> Plan | None:
 
 def _empty(n: int, mpc: MPC) -> Solution:
     plan = Plan.none(n, mpc)
-    stats: dict[str, NDArray[Any]] = {"iterations": np.zeros(n, dtype=np.int64), "residual": np.zeros(n)}
+    iterations = np.zeros(n, dtype=np.int64)
+    stats: Stats = {"iterations": iterations, "time": 0.0, "residual": np.zeros(n), "words": [""] * n}
     u0, value, success = np.empty((n, mpc.nu)), np.empty(n), np.zeros(n, dtype=bool)
-    return Solution(u0, plan.x, plan.u, value, success, [""] * n, stats)
+    return Solution(u0, plan.x, plan.u, value, success, [Status.NOT_OPTIMAL] * n, stats)
 
 
 def _put(target: Solution, rows: NDArray[np.intp], part: Solution) -> None:
     """Writes the solution of some problems into that of all."""
     for name in ("u0", "x", "u", "value", "success"):
         getattr(target, name)[rows] = getattr(part, name)
-    for name in ("iterations", "residual"):
-        target.stats[name][rows] = part.stats[name]
-    for row, status in zip(rows, part.status, strict=True):
-        target.status[row] = status
+    target.stats["iterations"][rows] = part.stats["iterations"]
+    target.stats["residual"][rows] = part.stats["residual"]
+    for row, status, words in zip(rows, part.status, part.words, strict=True):
+        target.status[row], target.stats["words"][row] = status, words

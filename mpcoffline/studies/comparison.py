@@ -17,6 +17,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.datasets import load_dataset
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.envs import PLANTS
 from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.estimation.smoothing import with_measurement_noise
 from mpcoffline.gallery.collection import starting_states
@@ -31,8 +32,6 @@ Condition = Literal["clean", "noise", "mismatch"]
 
 NOISE = 0.05  # of each coordinate's standard deviation
 FIRST_START = 50_000  # seeds of the starts; nothing was tuned on them
-#: What the mismatched models lack: the cart-pole's friction; the pendulum's true length, which gravity and input share.
-_FIXED = {"cartpole": ("mu", 0.0), "pendulum": ("l", 1.3)}
 
 
 @dataclass(frozen=True)
@@ -40,11 +39,11 @@ class CaseGroup:
     """Cases of one task that share the data, and so the value functions, which are learned in the first case.
 
     Attributes:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         data_seed: Seed of the agent that made the data; 0 is the shipped set.
         condition: ``"clean"``; ``"noise"``: 5 % measurement noise on s and s+ independently; ``"mismatch"``: a model
             that cannot become the plant.
-        cases: ``(alpha, seed of the model error)``; in the linear task alpha is the plant's, of which there is one.
+        cases: ``(alpha, seed of the model error)``; where alpha is the plant's, there is one.
     """
 
     task: str
@@ -53,16 +52,21 @@ class CaseGroup:
     cases: tuple[tuple[float, int], ...]
 
     @property
+    def alpha_is_the_plants(self) -> bool:
+        """Whether alpha changes the plant, and not the model of MPC_1."""
+        return PLANTS[self.task].max_alpha is not None
+
+    @property
     def name(self) -> str:
         """A short name, which is also that of a file."""
-        plant = f"-alpha{self.cases[0][0]:g}" if self.task == "linear" else ""
+        plant = f"-alpha{self.cases[0][0]:g}" if self.alpha_is_the_plants else ""
         return f"{self.task}-data{self.data_seed}-{self.condition}{plant}"
 
     @property
     def recipe(self) -> Recipe:
         """How the data are made."""
         recipe = Recipe.load(self.task).vary(seed=self.data_seed)
-        return recipe.vary(alpha=self.cases[0][0]) if self.task == "linear" else recipe
+        return recipe.vary(alpha=self.cases[0][0]) if self.alpha_is_the_plants else recipe
 
 
 @dataclass(frozen=True)
@@ -141,9 +145,9 @@ def run_group(group: CaseGroup, n_episodes: int) -> list[Row]:
     values: dict[str, ValueFunction] = {}
     arenas = [_Arena(group, setup_of(group.task, alpha, seed), n_episodes) for alpha, seed in group.cases]
     for arena in arenas:
-        run = _linear_rows if group.task == "linear" else _swing_up_rows
+        run = _linear_rows if group.alpha_is_the_plants else _swing_up_rows
         rows += run(arena, table, values)
-    if group.task != "linear" and group.condition == "clean":
+    if not group.alpha_is_the_plants and group.condition == "clean":
         arenas[0].actions = [actions for arena in arenas for actions in arena.actions]
         rows.append(arenas[0].best_known())
     return rows
@@ -163,7 +167,9 @@ def _learned(
 
 def _swing_up_rows(arena: _Arena, table: TransitionTable, values: dict[str, ValueFunction]) -> Iterator[Row]:
     setup = arena.setup
-    nominal = setup.nominal if arena.group.condition != "mismatch" else without(setup.nominal, *_FIXED[setup.task])
+    nominal, mismatch = setup.nominal, PLANTS[setup.task].mismatch
+    if arena.group.condition == "mismatch" and mismatch is not None:
+        nominal = without(nominal, *mismatch)
     yield arena.row("MPC_1", nominal)
     for name, learn in (("MPC_2 (paper)", "cost"), ("MPC_3 (paper)", "cost+model")):
         learner, seconds = _learned(nominal, table, values, "paper", cast("Learn", learn), preset="paper")
@@ -234,8 +240,11 @@ def groups(
     first, large = data_seeds[0], tuple((1.5, seed) for seed in model_seeds)
     small = ((0.0, 0), *((alpha, seed) for alpha in alphas for seed in model_seeds[:2]))
     found: list[CaseGroup] = []
-    for task in ("pendulum", "cartpole"):
+    published = [plant for plant in PLANTS.values() if plant.published]
+    for task in (plant.name for plant in published if plant.max_alpha is None):
         found += [CaseGroup(task, seed, "clean", large + (small if seed == first else ())) for seed in data_seeds]
         found += [CaseGroup(task, first, "noise", large[:3]), CaseGroup(task, first, "mismatch", large[:3])]
-    found += [CaseGroup("linear", first, "clean", ((alpha, 0),)) for alpha in (0.0, 0.5, 1.0, 1.5, 2.0)]
-    return found + [CaseGroup("linear", seed, "clean", ((1.0, 0),)) for seed in data_seeds[1:]]
+    for task in (plant.name for plant in published if plant.max_alpha is not None):
+        found += [CaseGroup(task, first, "clean", ((alpha, 0),)) for alpha in (0.0, 0.5, 1.0, 1.5, 2.0)]
+        found += [CaseGroup(task, seed, "clean", ((1.0, 0),)) for seed in data_seeds[1:]]
+    return found

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from mpcoffline.core.types import Array
+from mpcoffline.envs import PLANTS
 from mpcoffline.plotting import (
     PAGE_WIDTH,
-    Signal,
     draw_bars,
     draw_signal,
     legend_handles,
     new_figure,
     paper_style,
 )
-from mpcoffline.plotting.panels import TASKS
+from mpcoffline.plotting.signals import signals_of
 
 from .results import REFERENCE, TaskResult
 
@@ -37,7 +35,9 @@ def main_job_figure(result: TaskResult) -> Figure:
     Returns:
         The figure; :func:`mpcoffline.plotting.save_figure` writes it.
     """
-    signals = _signals(result)
+    plant = PLANTS[result.task]
+    states, actions = ({name: _example(result, name)[i] for name in SHOWN} for i in (0, 1))
+    signals = signals_of(plant, states, actions)
     with paper_style():
         figure = new_figure(PAGE_WIDTH, 0.6 + 2.85 * max(1.0, 0.3 * len(signals)))
         left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(2.1, 1.0)))
@@ -47,7 +47,7 @@ def main_job_figure(result: TaskResult) -> Figure:
         left.align_ylabels()
         panels[-1].set_xlabel("time (s)")
         length = result.dt * (len(signals[0].values[SHOWN[0]]) - 1)
-        panels[-1].set_xlim(0.0, min(length, TASKS[result.env_id].seconds or length))
+        panels[-1].set_xlim(0.0, min(length, plant.seconds or length))
         handles, labels = legend_handles(SHOWN)
         left.legend(handles, labels, loc="outside upper center", ncols=3, handlelength=3.2)
         bars = right.subplots()
@@ -55,19 +55,6 @@ def main_job_figure(result: TaskResult) -> Figure:
         bars.set_ylabel("cost relative to the reference")
         _explain_bars(right)
     return figure
-
-
-def _signals(result: TaskResult) -> list[Signal]:
-    states, actions = ({name: _example(result, name)[i] for name in SHOWN} for i in (0, 1))
-    space = gym.make(result.env_id).action_space
-    signals = [
-        Signal(c.label, {name: s[:, c.index] for name, s in states.items()}, target=0.0, angle=c.angle, band=c.band)
-        for c in TASKS[result.env_id].states
-    ]
-    for i, label in enumerate(TASKS[result.env_id].actions):
-        bounds = (float(space.low[i]), float(space.high[i])) if isinstance(space, spaces.Box) else None
-        signals.append(Signal(label, {name: a[:, i] for name, a in actions.items()}, bounds=bounds, held=True))
-    return signals
 
 
 def _example(result: TaskResult, name: str) -> tuple[Array, Array]:

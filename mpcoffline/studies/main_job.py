@@ -49,14 +49,14 @@ def run_task(
 
     MPC_1 is the nominal controller (wrong model, nominal cost). One value function is learned, (VALUE), and from it the
     cost, (FIT) with a fixed model: MPC_2, and cost and model together: MPC_3. All run from the same starts, two thirds
-    of the swing-ups' broad and one third hanging, next to a reference: the closed-loop optimum in the linear task,
-    MPC_1 with the true model in the swing-ups.
+    of the swing-ups' broad and one third hanging, next to the plant's reference: the closed-loop optimum in the linear
+    task, MPC_1 with the true model in the others.
 
     The output folder receives ``results.json``, ``results.md``, ``results.csv``, ``figure.pdf``, ``figure.png``, and in
     ``controllers/`` the saved policies and learners; existing files of these names are replaced.
 
     Args:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         alpha: Size of the model error.
         seed: Seeds the model error, the learning and the starts.
         dataset: Minari id of the data; the task's DDPG data by default.
@@ -124,7 +124,7 @@ def run_task(
         seed=seed,
         env_id=setup.env_id,
         dataset_id=str(data.spec.dataset_id),
-        value=learners["MPC_2"][0].config.value.method,
+        value=str(learners["MPC_2"][0].method.options["value"]),
         discount=setup.nominal.discount,
         dt=setup.nominal.model.dt,
         starts=starts,
@@ -186,8 +186,9 @@ def _controller_result(
 
 def _behaviour(table: TransitionTable, discount: float) -> ControllerResult:
     """The costs of the last episodes in the data: how good the agent that recorded them had become."""
-    last = np.unique(table.episode_ids)[-_LAST_EPISODES:]
-    episodes = [table.costs[table.episode_ids == i].astype(np.float64) for i in last]
+    places = table.episodes
+    last = range(len(places.ids))[-_LAST_EPISODES:]
+    episodes = [table.take(places.rows(k)).costs.astype(np.float64) for k in last]
     return ControllerResult(
         name="behaviour",
         description=f"the agent that made the data, its last {len(last)} episodes (own starts, with exploration)",

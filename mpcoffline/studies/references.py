@@ -2,55 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
 import gymnasium as gym
 import numpy as np
 
+from mpcoffline.core.checks import check_known
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
-from mpcoffline.envs import cartpole_swing_up as cartpole
-from mpcoffline.envs import pendulum_swing_up as pendulum
+from mpcoffline.envs import PLANTS, Plant
 from mpcoffline.envs.episode import EPISODE_STEPS
 from mpcoffline.mpc import MPC, LiftedCost, Model, QuadraticCost
 from mpcoffline.solvers import make_solver
 from mpcoffline.solvers.interface import Plan
-
-
-class _SwingUp(NamedTuple):
-    """A swing-up in the state s: the equation of motion, the cost's weights, the entry that is an angle."""
-
-    env_id: str
-    ode: Callable[[ca.SX, ca.SX, Any], ca.SX]
-    weights: tuple[float, ...]
-    angle: int
-    bound: float
-    dt: float = pendulum.PendulumSwingUpEnv.dt  # of both
-
-
-def _pendulum(s: ca.SX, u: ca.SX, p: Any) -> ca.SX:
-    gravity = 1.5 * pendulum.GRAVITY / pendulum.LENGTH
-    return ca.vertcat(s[1], gravity * ca.sin(s[0]) + 3.0 / (pendulum.MASS * pendulum.LENGTH**2) * u)
-
-
-def _cartpole(s: ca.SX, u: ca.SX, p: Any) -> ca.SX:
-    sin, cos = ca.sin(s[2]), ca.cos(s[2])
-    mass = cartpole.CART_MASS + cartpole.POLE_MASS
-    moment = cartpole.POLE_MASS * cartpole.HALF_LENGTH
-    force = cartpole.FRICTION * s[1] - u - moment * s[3] ** 2 * sin
-    inertia = cartpole.HALF_LENGTH * (4.0 / 3.0 - cartpole.POLE_MASS * cos**2 / mass)
-    phidd = (cartpole.GRAVITY * sin + cos * force / mass) / inertia
-    xdd = (u - cartpole.FRICTION * s[1] + moment * (s[3] ** 2 * sin - phidd * cos)) / mass
-    return ca.vertcat(s[1], xdd, s[3], phidd)
-
-
-_SWING_UPS = {
-    "pendulum": _SwingUp("mpcoffline/PendulumSwingUp-v0", _pendulum, (1.0, 0.1), 0, pendulum.MAX_TORQUE),
-    "cartpole": _SwingUp("mpcoffline/CartPoleSwingUp-v0", _cartpole, (2.0, 0.1, 1.0, 0.1), 2, cartpole.MAX_FORCE),
-}
-_ACTION_WEIGHT = 0.1
 
 
 def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), discount: float = 1.0) -> Array:
@@ -61,46 +27,67 @@ def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), di
     gamma near one most starting points end in poor local minima; the guesses are what matters there.
 
     Args:
-        task: ``"pendulum"`` or ``"cartpole"``.
+        task: Name of a plant whose cost is a sum of squares of states and inputs.
         states: Initial states s, ``(n, ns)``.
-        guesses: Actions of controllers from these states, each ``(n, 100, 1)``.
+        guesses: Actions of controllers from these states, each ``(n, 100, nu)``.
         discount: gamma of the cost; 1 for J.
 
     Returns:
         Costs, ``(n,)``.
 
     Raises:
-        InvalidArgumentError: For another task.
+        UnknownIdError: For a name of no plant.
+        InvalidArgumentError: For a plant with another cost, or without an equation of motion.
     """
-    if not isinstance(task, str) or task not in _SWING_UPS:
-        raise InvalidArgumentError("task", expected=f"one of {', '.join(_SWING_UPS)}", actual=repr(task))
-    swing_up, states = _SWING_UPS[task], np.asarray(states, dtype=np.float64)
-    solver = make_solver(_episode(swing_up, discount), "auto")
+    check_known("task", task, PLANTS)
+    plant, states = PLANTS[task], np.asarray(states, dtype=np.float64)
+    solver = make_solver(_episode(plant, discount), "auto")
     plans = [solver.solve(states).u, *guesses]
     for actions in guesses:
-        x = replay(swing_up.env_id, states, actions, discount).states
-        x[..., swing_up.angle] = np.unwrap(x[..., swing_up.angle], axis=1)
+        x = replay(plant.id, states, actions, discount).states
+        if plant.angle is not None:
+            x[..., plant.angle] = np.unwrap(x[..., plant.angle], axis=1)
         plans.append(solver.solve(states, warm_start=Plan(x, actions)).u)
-    return np.asarray(np.min([replay(swing_up.env_id, states, u, discount).cost for u in plans], axis=0))
+    return np.asarray(np.min([replay(plant.id, states, u, discount).cost for u in plans], axis=0))
 
 
-def _episode(swing_up: _SwingUp, discount: float) -> MPC:
+def _episode(plant: Plant, discount: float) -> MPC:
     """A whole episode as one optimal control problem in s; the cost wraps the angle, as the environment's does."""
-    n, angle = len(swing_up.weights), swing_up.angle
+    nx, nu, p = len(plant.states), len(plant.inputs), {q.name: q.value for q in plant.parameters}
+
+    def ode(s: ca.SX, u: ca.SX, _: Any) -> ca.SX:
+        y = plant.lift(ca.vertsplit(s), ca.cos, ca.sin)
+        rates: Any = plant.dynamics(y, ca.vertsplit(u), p)
+        return ca.SX(ca.vertcat(*rates))
 
     def wrapped(s: ca.SX) -> ca.SX:
-        phi = ca.atan2(ca.sin(s[angle]), ca.cos(s[angle]))
-        return ca.vertcat(*(phi if i == angle else s[i] for i in range(n)))
+        angles = (ca.atan2(ca.sin(value), ca.cos(value)) for value in ca.vertsplit(s))
+        return ca.vertcat(*(a if c.angle else s[c.index] for c, a in zip(plant.states, angles, strict=True)))
 
+    state_weights, input_weights, rest = _weights(plant)
     return MPC(
-        model=Model(swing_up.ode, n, 1, swing_up.dt),
-        stage_cost=LiftedCost(wrapped, np.zeros(n), np.diag(swing_up.weights), [[_ACTION_WEIGHT]]),
-        terminal_cost=QuadraticCost(np.zeros((n, n))),
+        model=Model(ode, nx, nu, plant.dt),
+        stage_cost=LiftedCost(wrapped, np.zeros(nx), state_weights, input_weights, u_ref=rest),
+        terminal_cost=QuadraticCost(np.zeros((nx, nx))),
         horizon=EPISODE_STEPS,
         discount=discount,
-        action_low=[-swing_up.bound],
-        action_high=[swing_up.bound],
+        action_low=[c.low for c in plant.inputs],
+        action_high=[c.high for c in plant.inputs],
     )
+
+
+def _weights(plant: Plant) -> tuple[Array, Array, Array]:
+    """W, R and the input at rest of a cost ``s'Ws + (u - rest)'R(u - rest)``, from its derivatives."""
+    nx, nu = len(plant.states), len(plant.inputs)
+    z = ca.SX.sym("z", nx + nu)
+    entries = ca.vertsplit(z)
+    hessian, gradient = ca.hessian(plant.cost(entries[:nx], entries[nx:]), z)
+    if plant.discrete or ca.symvar(hessian):
+        expected = "a plant with an equation of motion and a cost that is a sum of squares of states and inputs"
+        raise InvalidArgumentError("task", expected=expected, actual=repr(plant.name))
+    H = np.asarray(ca.Function("H", [], [hessian])()["o0"].full()) / 2.0
+    slope = ca.Function("g", [z], [gradient])(np.zeros(nx + nu)).full().ravel() / 2.0
+    return H[:nx, :nx], H[nx:, nx:], -np.linalg.solve(H[nx:, nx:], slope[nx:])
 
 
 class Replay(NamedTuple):

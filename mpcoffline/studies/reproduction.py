@@ -7,12 +7,13 @@ from pathlib import Path
 
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.outputs import check_output_folder, write_file
+from mpcoffline.envs import PLANTS
 
 from .main_job import OUTPUTS, run_task
 from .results import TaskResult
 from .setups import setup_of
 
-TASKS = ("linear", "pendulum", "cartpole")
+TASKS = tuple(plant.name for plant in PLANTS.values() if plant.published)
 
 
 def reproduce(

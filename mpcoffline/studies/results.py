@@ -74,7 +74,7 @@ class TaskResult:
     """The outcome of the main job for one task.
 
     Attributes:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         alpha: Size of the model error.
         seed: Seed of model error, learning and starts.
         env_id: Gymnasium id.

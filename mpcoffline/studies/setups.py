@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
-import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from mpcoffline.core.checks import checked_seed
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.recipes import Recipe
-from mpcoffline.envs import ControlTask
-from mpcoffline.envs.linear_tracking import ACTION_WEIGHT, MAX_ALPHA, STATE_WEIGHT, plant_matrices
-from mpcoffline.mpc import MPC, QuadraticCost
+from mpcoffline.envs import PLANTS, ControlTask
+from mpcoffline.mpc import MPC
 from mpcoffline.plants.nominal import nominal_mpc
+from mpcoffline.plants.optimal import optimal_linear_mpc
 
 
 @dataclass(frozen=True)
@@ -23,7 +21,7 @@ class Setup:
     """One task at one model error.
 
     Attributes:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         alpha: Size of the model error.
         seed: Seed of the model error's draws.
         env_id: Gymnasium id.
@@ -58,11 +56,11 @@ class Setup:
 def setup_of(task: str, alpha: float, seed: int) -> Setup:
     """The setup of a task as in arXiv:2301.01667.
 
-    The swing-ups are compared with MPC_1 at alpha = 0 (true model, nominal cost), the linear task with the closed-loop
-    optimum.
+    Compared is with what the plant names as its reference: MPC_1 at alpha = 0 (true model, nominal cost) in the
+    swing-ups, the closed-loop optimum in the linear task.
 
     Args:
-        task: ``"linear"``, ``"pendulum"`` or ``"cartpole"``.
+        task: Short name of the plant.
         alpha: Size of the model error. In the linear task it changes the plant and with it the data set.
         seed: Seed of the model error's draws; the linear task has none.
 
@@ -71,47 +69,27 @@ def setup_of(task: str, alpha: float, seed: int) -> Setup:
         InvalidArgumentError: For an alpha out of the task's range, or a negative seed.
     """
     recipe, seed = Recipe.load(task), checked_seed("seed", seed)
-    if recipe.alpha is None:
-        return Setup(
-            task,
-            alpha,
-            seed,
-            recipe.env_id,
-            {},
-            recipe.dataset_id,
-            nominal=nominal_mpc(recipe.env_id, alpha=alpha, seed=seed),
-            reference=nominal_mpc(recipe.env_id),
-            reference_description="MPC_1 with the true model (alpha = 0)",
-        )
-    if not 0.0 <= alpha <= MAX_ALPHA:
-        raise InvalidArgumentError("alpha", expected=f"a number from 0 to {MAX_ALPHA:g}", actual=str(alpha))
-    recipe = recipe.vary(alpha=alpha)
-    nominal = nominal_mpc(recipe.env_id)
+    plant = PLANTS[task]
+    arguments: dict[str, Any] = {}
+    if plant.max_alpha is not None:
+        if not 0.0 <= alpha <= plant.max_alpha:
+            expected = f"a number from 0 to {plant.max_alpha:g}"
+            raise InvalidArgumentError("alpha", expected=expected, actual=str(alpha))
+        recipe, arguments = recipe.vary(alpha=alpha), {"alpha": alpha}
+    error: dict[str, Any] = {} if arguments else {"alpha": alpha, "seed": seed}
+    reference, description = nominal_mpc(plant.id), "MPC_1 with the true model (alpha = 0)"
+    if plant.reference == "riccati":
+        unwrapped = cast("ControlTask", gym.make(plant.id, **arguments).unwrapped)
+        reference = optimal_linear_mpc(plant, **unwrapped.parameters)
+        description = "closed-loop optimum (true plant and cost, discounted Riccati terminal cost)"
     return Setup(
         task,
         alpha,
         seed,
-        recipe.env_id,
-        {"alpha": alpha},
+        plant.id,
+        arguments,
         recipe.dataset_id,
-        nominal=nominal,
-        reference=optimal_linear_mpc(nominal, alpha),
-        reference_description="closed-loop optimum (true plant and cost, discounted Riccati terminal cost)",
+        nominal=nominal_mpc(plant.id, **error),
+        reference=reference,
+        reference_description=description,
     )
-
-
-def optimal_linear_mpc(nominal: MPC, alpha: float) -> MPC:
-    """The optimal controller of the linear task: the MPC with the true plant, the true cost and terminal cost V*.
-
-    While no input bound is active it equals the linear feedback of the Riccati equation
-    P = W + gamma A'PA - gamma^2 A'PB (R + gamma B'PB)^-1 B'PA; where bounds are active it respects them.
-
-    Args:
-        nominal: MPC_1 of the task.
-        alpha: The plant.
-    """
-    A, B = plant_matrices(alpha)
-    root = np.sqrt(nominal.discount)
-    P = solve_discrete_are(root * A, root * B, STATE_WEIGHT, ACTION_WEIGHT)
-    true_model = nominal.with_theta(nominal.space.pack({"model.A": A, "model.B": B}))
-    return true_model.replace(terminal_cost=QuadraticCost((P + P.T) / 2.0))

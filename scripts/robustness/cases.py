@@ -19,9 +19,12 @@ import traceback
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 EQUAL, OTHER, REFUSED = "as the original", "other content", "refused"
 EXECUTION, CRASH, RAW, TIME, MEMORY, WRONG, LET_IN = (
@@ -122,13 +125,11 @@ def run(case: Case, seed: int, scratch: Path, keep: bool = False) -> Outcome:
         os.close(ours)
         _in_child(case, seed, folder, theirs)
     os.close(theirs)
-    said = b""
-    while part := os.read(ours, 65536):
-        said += part
-    os.close(ours)
     _, code = os.waitpid(child, 0)
     with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)  # what it started
+        os.killpg(child, signal.SIGKILL)  # what it started, which holds the pipe open
+    with os.fdopen(ours, "rb") as pipe:
+        said = pipe.read()
     outcome = _judged(case.name, said.decode(errors="replace").splitlines(), code, folder)
     if not keep:
         _remove(folder)
@@ -137,7 +138,7 @@ def run(case: Case, seed: int, scratch: Path, keep: bool = False) -> Outcome:
 
 def _in_child(case: Case, seed: int, folder: Path, pipe: int) -> None:
     def say(*words: str) -> None:
-        os.write(pipe, (json.dumps(words) + "\n").encode())
+        os.write(pipe, (json.dumps([word[:2000] for word in words]) + "\n").encode())  # a pipe holds 64 KB
 
     try:
         os.setsid()
@@ -218,24 +219,33 @@ def _remove(folder: Path) -> None:
 
 def run_all(cases: list[Case], seed: int, scratch: Path, workers: int, keep: bool = False) -> Iterator[Outcome]:
     """Runs cases in several processes, each of which forks one for each of its cases."""
-    ours, theirs = os.pipe()
-    pids = []
-    for number in range(workers):
-        pid = os.fork()
-        if pid == 0:
-            os.close(ours)
-            for case in cases[number::workers]:
-                outcome = run(case, seed, scratch, keep)
-                short = replace(outcome, detail=outcome.detail[:400], mutation=outcome.mutation[:150])
-                os.write(theirs, (json.dumps(asdict(short)) + "\n").encode())  # so short that no write is torn
-            os._exit(0)
-        pids.append(pid)
-    os.close(theirs)
-    with os.fdopen(ours, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            yield Outcome(**json.loads(line))
-    for pid in pids:
-        os.waitpid(pid, 0)
+
+    def short(case: Case) -> Outcome:
+        outcome = run(case, seed, scratch, keep)
+        return replace(outcome, detail=outcome.detail[:400], mutation=outcome.mutation[:150])
+
+    return spread(short, cases, workers)
+
+
+def spread(
+    job: Callable[[Any], Any], items: list[Any], workers: int, begin: Callable[[], object] | None = None
+) -> Iterator[Any]:
+    """What a function gives for each of some things, as it comes: from several processes, which begin with ``begin``.
+
+    What goes wrong in one of them is an error here, and no second script that goes on in a fork of this one.
+    """
+    _SPREAD[:] = job, items
+    with ProcessPoolExecutor(workers, get_context("fork"), begin) as pool:
+        for done in as_completed([pool.submit(_one, number) for number in range(len(items))]):
+            yield done.result()
+
+
+_SPREAD: list[Any] = []  # what the processes have from their fork: most of it cannot be sent
+
+
+def _one(number: int) -> Any:
+    job, items = _SPREAD
+    return job(items[number])
 
 
 def with_progress(outcomes: Iterable[Outcome], total: int) -> list[Outcome]:

@@ -15,7 +15,7 @@ import numpy as np
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable, nominal_mpc
-from mpcoffline.datasets import dataset_from_arrays, record, repair
+from mpcoffline.datasets import dataset_from_arrays, load_dataset, record, repair
 from mpcoffline.datasets.store.packed import pack
 
 ENV = "mpcoffline/LinearTracking-v0"
@@ -117,7 +117,7 @@ def make_honest(folder: Path) -> Honest:
         record(short_env(), actions(0), EPISODES, SET, seed=0)
         table = TransitionTable.from_minari(SET)
         TransitionTable.from_minari(SET, memory=1, cache=folder / "tables").statistics()
-        pack(__import__("minari").load_dataset(SET), folder / "packed.h5")
+        pack(load_dataset(SET), folder / "packed.h5")
         policy = MPCPolicy(small_mpc())
         policy.predict(x)
         policy.save(folder / "policy.zip")

@@ -186,20 +186,11 @@ class Round:
             self.swept()
 
     def swept(self) -> None:
-        """Nothing hidden stays behind, once it is asked to clean up where it can."""
-        if leftovers() and can_clean():
+        """Nothing hidden stays behind, once it is asked to clean up."""
+        if leftovers():
             self.run(clean)
         if left := leftovers():
             self.problem(f"left: {', '.join(left)[:200]}")
-
-
-def can_clean() -> bool:
-    """Whether there is a command that cleans up."""
-    from typer.main import get_group
-
-    from mpcoffline.cli.main import app
-
-    return "clean" in get_group(app).commands
 
 
 def clean() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import random
@@ -48,8 +47,6 @@ def all_cases(honest: Honest, share: float) -> list[Case]:
     for kind, count in FULL.items():
         target = next(name for name in readers if kind.startswith(name))
         make = partial(readers[target], honest, kind)
-        if kind.startswith("log salvaged") and "salvage" not in inspect.signature(repair).parameters:
-            continue
         cases += [Case(f"{kind}/{k}", make, needs[target]) for k in range(max(2, round(count * share)))]
     return cases
 
@@ -158,7 +155,7 @@ def learner_fingerprint(one: OfflineMPCLearner) -> str:
     sizes = np.linspace(-1, 1, 3 * one.nominal_mpc.nx).reshape(3, -1)
     numbers = None if value is None else np.asarray(value.predict(sizes)).tolist()
     mpcs = [one.nominal_mpc.to_json(), one.mpc.to_json()]
-    settings = [one.learn, one.preset, one.seed, str(one.config), str(one.result)]
+    settings = [one.learn, one.preset, one.seed, str(one.method), str(one.result)]
     return json.dumps([numbers, mpcs, one.history, *settings], sort_keys=True, default=str)
 
 

@@ -173,7 +173,7 @@ def test_learn_saves_learner_and_policy(tmp_path: Path, monkeypatch: pytest.Monk
     )
     assert result.exit_code == 0, result.output
     learner = OfflineMPCLearner.load(tmp_path / "learner.zip")
-    assert (learner.learn, learner.config.value.method, learner.seed) == ("cost", "td", 2)
+    assert (learner.learn, learner.method.options["value"], learner.seed) == ("cost", "td", 2)
     np.testing.assert_array_equal(MPCPolicy.load(tmp_path / "learner_policy.zip").mpc.theta, learner.theta)
     np.testing.assert_array_equal(learner.nominal_mpc.theta, nominal_mpc(PENDULUM, alpha=1.0, seed=2).theta)
     assert "stage_cost.W" in plain(result)

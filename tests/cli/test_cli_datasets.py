@@ -29,6 +29,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_show_prints_the_card_and_draws_the_coverage(tmp_path: Path) -> None:
     code, output = run("show", SHIPPED, "--figure", str(tmp_path / "coverage.png"))
     assert code == 0
@@ -45,6 +46,7 @@ def test_show_refuses_a_figure_that_cannot_be_written(name: str, tmp_path: Path)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_verify_replay_and_repair_of_intact_data() -> None:
     assert run("verify", SHIPPED)[0] == 0
     code, output = run("replay", SHIPPED, "--episodes", "3")
@@ -55,13 +57,12 @@ def test_verify_replay_and_repair_of_intact_data() -> None:
     assert "intact" in output
 
 
-@pytest.mark.slow
 def test_verify_says_what_is_wrong(tmp_path: Path) -> None:
-    run("show", SHIPPED)
-    metadata = tmp_path / "minari" / SHIPPED / "data" / "metadata.json"
+    dataset_from_arrays("mine/log-v0", [(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros(3))])
+    metadata = tmp_path / "minari" / "mine" / "log-v0" / "data" / "metadata.json"
     content = json.loads(metadata.read_text())
     metadata.write_text(json.dumps(content | {"total_episodes": 499}))
-    code, output = run("verify", SHIPPED)
+    code, output = run("verify", "mine/log-v0")
     assert code == 1
     assert "499" in output
 
@@ -85,6 +86,7 @@ def test_list_as_json_is_one_document() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_show_as_json_has_the_numbers() -> None:
     result = CliRunner().invoke(app, ["datasets", "show", SHIPPED, "--json"])
     summary = json.loads(result.stdout)

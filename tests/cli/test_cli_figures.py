@@ -99,6 +99,7 @@ class MadeUpReport:
         return [path]
 
 
+@pytest.mark.usefixtures("shipped")
 def test_diagnose_prints_the_report_or_its_json(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mpcoffline.diagnostics.diagnose", lambda *_, **__: MadeUpReport())
     arguments = ("diagnose", files / "learner.zip", "--dataset", DATA, "--out", "report.png")
@@ -113,6 +114,7 @@ def test_diagnose_prints_the_report_or_its_json(files: Path, monkeypatch: pytest
     ("work", "command"),
     [("mpcoffline.evaluate", ["plot"]), ("mpcoffline.diagnostics.diagnose", ["diagnose", "--dataset", DATA])],
 )
+@pytest.mark.usefixtures("shipped")
 def test_ctrl_c_leaves_no_files(files: Path, work: str, command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, lambda *_, **__: signal.raise_signal(signal.SIGINT))
     result = call(*command, files / "learner.zip")

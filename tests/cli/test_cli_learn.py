@@ -14,10 +14,10 @@ from typer.testing import CliRunner, Result
 
 import mpcoffline
 from mpcoffline import MPCPolicy, OfflineMPCLearner, nominal_mpc
-from mpcoffline.cli.common import Preset, ValueForm
+from mpcoffline.cli.common import Preset
 from mpcoffline.cli.main import app
-from mpcoffline.learner.presets import PRESETS, LearnerConfig
-from mpcoffline.learning import VALUE_METHODS
+from mpcoffline.learner.presets import PRESETS
+from mpcoffline.learning import Bellman
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 DATA = "mpcoffline/pendulum/ddpg-v0"
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.chdir(tmp_path)
-    brief = LearnerConfig().replaced(
+    brief = Bellman().replaced(
         {"value_n_steps": 20, "value_batch_size": 16, "hidden": (8,), "fit_n_steps": 2, "refit_rows": 300}
     )
     for name in ("default", "paper"):  # whether learning succeeds is tested elsewhere
@@ -41,10 +41,10 @@ def call(*arguments: str) -> Result:
 
 
 def test_the_choices_are_those_of_the_library() -> None:
-    assert [form.value for form in ValueForm] == list(VALUE_METHODS)
     assert [preset.value for preset in Preset] == list(PRESETS)
 
 
+@pytest.mark.usefixtures("shipped")
 def test_options_reach_the_fit_and_json_describes_it() -> None:
     result = call(
         *("learn", "--dataset", DATA, "--preset", "paper", "--value", "td", "--discount", "0.93", "--horizon", "7"),
@@ -53,7 +53,7 @@ def test_options_reach_the_fit_and_json_describes_it() -> None:
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     learner = OfflineMPCLearner.load("mine.zip")
-    assert (learner.preset, learner.learn, learner.config.value.method) == ("paper", "cost", "td")
+    assert (learner.preset, learner.learn, learner.method.options["value"]) == ("paper", "cost", "td")
     assert (learner.mpc.discount, learner.mpc.horizon, learner.seed) == (0.93, 7, 3)
     assert (document["discount"], document["horizon"], document["preset"]) == (0.93, 7, "paper")
     np.testing.assert_array_equal(document["learned"]["stage_cost.W"], learner.mpc.values["stage_cost.W"])
@@ -64,6 +64,7 @@ def test_options_reach_the_fit_and_json_describes_it() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_an_interrupted_fit_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("learn", "--dataset", DATA, "--steps", "501", "--checkpoint", "fit.ckpt")  # an epoch has 500
     fit = OfflineMPCLearner.fit

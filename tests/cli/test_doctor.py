@@ -98,7 +98,7 @@ def test_a_missing_needed_package_fails(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_what_is_needed_is_what_the_metadata_say() -> None:
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))["project"]
     assert [each.name for each in doctor._needed()] == [Requirement(text).name for text in project["dependencies"]]
 
 

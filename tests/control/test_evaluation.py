@@ -181,6 +181,8 @@ class Countdown(gym.Env[NDArray[Any], NDArray[Any]]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
+        if options:
+            raise ValueError("no such option")
         self.left = seed or 1
         return np.array([1.0]), {}
 
@@ -223,6 +225,19 @@ def test_a_policy_never_sees_what_comes_after_the_end(countdown: str) -> None:
             return super().predict(observation, *rest, **more)
 
     evaluate(Strict(1, 1, 1.0), countdown, 3, seed=1)
+
+
+def test_what_fails_leaves_nothing_open_and_nobody_watching(countdown: str) -> None:
+    policy, given = Linear(1, 1, 1.0), Countdown()
+    with pytest.raises(ValueError, match="no such option"):
+        evaluate(policy, given, 1, options={"a": 1})
+    assert not {"step", "reset"} & vars(given).keys()
+    Countdown.opened = 0
+    with pytest.raises(ValueError, match="no such option"):
+        evaluate(policy, countdown, 3, seed=1, options=[{}, {"a": 1}, {}])
+    with pytest.raises(InvalidArgumentError, match="max_episode_steps"):
+        evaluate(policy, countdown, 3, max_episode_steps=0)
+    assert Countdown.closed == Countdown.opened > 0
 
 
 # ---------------------------------------------------------------- bad input

@@ -11,7 +11,8 @@ import casadi as ca
 import lq_plant
 import numpy as np
 import pytest
-from mpc_problems import CARTPOLE, LINEAR, PENDULUM, random_linear, random_states
+from mpc_problems import random_linear, random_states
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner
 from mpcoffline.control.export import export_c
@@ -149,7 +150,7 @@ def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
         pytest.skip("no gcc")
     export_c(MPCPolicy(mpc_of(case)), tmp_path)
     try:
-        program = compiled(tmp_path, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+        program = compiled(tmp_path, "-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     except AssertionError as error:
         if "san" in str(error) and "cannot find" in str(error):
             pytest.skip("the compiler's sanitizer libraries are not installed")

@@ -42,7 +42,7 @@ def in_c(policy: MPCPolicy, folder: Path, steps: list[tuple[bool, Array]]) -> Ar
     export_c(policy, folder)
     (folder / "main.c").write_text(MAIN)
     program = folder / "program"
-    command = [find_compiler(), "-std=c99", "-O2", "-Wall", "-Werror", "-pedantic", str(folder / "main.c")]
+    command = [find_compiler(), "-std=c99", "-O0", "-Wall", "-Werror", "-pedantic", str(folder / "main.c")]
     subprocess.run([*command, str(folder / "mpc_controller.c"), "-o", str(program), "-lm"], check=True)
     lines = "\n".join(" ".join([str(int(reset)), *map(repr, y.tolist())]) for reset, y in steps)
     done = subprocess.run([program], input=lines, capture_output=True, text=True, check=True)

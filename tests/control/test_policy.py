@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from mpcoffline.control.evaluation import evaluate
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.mpc import MPC
 from mpcoffline.plants.nominal import nominal_mpc
@@ -242,7 +242,7 @@ class Recording(Solver):
 @pytest.fixture
 def recording(monkeypatch: pytest.MonkeyPatch) -> MPCPolicy:
     """A policy with the solver above."""
-    monkeypatch.setitem(SOLVERS, "recording", Recording)
+    monkeypatch.setitem(SOLVERS._things, "recording", Recording)
     monkeypatch.setattr(Recording, "calls", [])
     monkeypatch.setattr(Recording, "fail", set())
     return MPCPolicy(lq_plant.make_mpc(action_low=[-1.5], action_high=[1.75]), "recording")
@@ -358,7 +358,7 @@ def test_a_failed_solve_applies_the_previous_plan(recording: MPCPolicy, caplog: 
 def test_without_a_plan_a_failure_gives_zero_within_bounds(
     monkeypatch: pytest.MonkeyPatch, low: float, high: float, expected: float
 ) -> None:
-    monkeypatch.setitem(SOLVERS, "recording", Recording)
+    monkeypatch.setitem(SOLVERS._things, "recording", Recording)
     monkeypatch.setattr(Recording, "calls", [])
     monkeypatch.setattr(Recording, "fail", {0, 1})
     policy = MPCPolicy(lq_plant.make_mpc(action_low=[low], action_high=[high]), "recording")
@@ -380,11 +380,44 @@ def test_a_closed_loop_survives_a_solver_that_always_fails(monkeypatch: pytest.M
             stats = {"iterations": np.zeros(n, dtype=int), "time": 0.0}
             return Solution(u[:, 0], states, u, np.full(n, np.nan), np.zeros(n, dtype=bool), ["no"] * n, stats)
 
-    monkeypatch.setitem(SOLVERS, "hopeless", Hopeless)
+    monkeypatch.setitem(SOLVERS._things, "hopeless", Hopeless)
     policy = MPCPolicy(short_pendulum(), "hopeless")
     result = evaluate(policy, PENDULUM, 2)
     assert (np.concatenate(result.actions) == 0.0).all()
     assert policy.solver_stats.n_failures == policy.solver_stats.n_solves == 200
+
+
+# ---------------------------------------------------------------- a solver that is made already
+
+
+def test_a_solver_stands_where_its_name_does(tmp_path: Path) -> None:
+    mpc = short_pendulum()
+    solver = IpoptSolver(mpc, n_starts=2, max_iterations=50)
+    policy, named = MPCPolicy(mpc, solver), MPCPolicy(mpc, "ipopt", n_starts=2, max_iterations=50)
+    assert policy.solver is solver
+    assert (policy.solver_name, policy.solver_options) == (named.solver_name, named.solver_options)
+    policy.save(tmp_path / "policy.zip")
+    x = np.array([0.3, 0.9, 0.1])
+    expected = named.predict(x)[0]
+    for again in (policy, MPCPolicy.load(tmp_path / "policy.zip"), copy.deepcopy(policy)):
+        np.testing.assert_array_equal(again.predict(x)[0], expected)
+    with pytest.raises(
+        InvalidArgumentError, match="solver: expected a name with options, or a solver of this very MPC"
+    ):
+        MPCPolicy(mpc, solver, n_starts=3)
+    with pytest.raises(InvalidArgumentError, match="of another MPC"):
+        MPCPolicy(short_pendulum(), solver)
+
+
+def test_a_policy_whose_solver_no_file_can_name_is_not_saved(tmp_path: Path) -> None:
+    class Mine(IpoptSolver):
+        pass
+
+    mpc = short_pendulum()
+    policy = MPCPolicy(mpc, Mine(mpc))
+    with pytest.raises(InvalidArgumentError, match=r"solver: expected one that is registered, .* got Mine"):
+        policy.save(tmp_path / "policy.zip")
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- bad input
@@ -510,9 +543,9 @@ def test_unbounded_spaces_survive(tmp_path: Path) -> None:
     assert (loaded.observation_space, loaded.action_space) == (policy.observation_space, policy.action_space)
 
 
-def test_a_learners_file_is_not_a_policy(tmp_path: Path) -> None:
+def test_a_learner_that_has_not_learned_has_no_policy(tmp_path: Path) -> None:
     OfflineMPCLearner(lq_plant.make_mpc()).save(tmp_path / "l.zip")
     before = (tmp_path / "l.zip").read_bytes()
-    with pytest.raises(FileFormatError, match=r"expected an mpcoffline policy file, got .*'learner'"):
+    with pytest.raises(MPCOfflineError, match="expected a learner that has learned, got one before its fit"):
         MPCPolicy.load(tmp_path / "l.zip")
     assert (tmp_path / "l.zip").read_bytes() == before

@@ -154,10 +154,12 @@ def test_the_honest_one_is_not(honest: Document, tmp_path: Path) -> None:
     assert policy.mpc.values.keys() == small().values.keys()
 
 
-def archives(honest: Document) -> dict[str, tuple[Document | str, bytes]]:
-    text = json.dumps(honest)
+@pytest.fixture(scope="module")
+def archives(honest: Document, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Policies whose archives are not what they seem: half a gigabyte of zeros in some of them."""
+    folder, text = tmp_path_factory.mktemp("archives"), json.dumps(honest)
     zeros = npy((1 << 26,), bytes(1 << 29))
-    return {
+    kinds = {
         "blanks": (text[:-1] + " " * limits.JSON_BYTES + "}", no_arrays()),
         "empty lists": (text[:-1] + ', "x": [' + "[]," * limits.JSON_CONTAINERS + "[]]}", no_arrays()),
         "a key twice": (text.replace('"discount":', '"discount": 0.5, "discount":'), no_arrays()),
@@ -169,11 +171,11 @@ def archives(honest: Document) -> dict[str, tuple[Document | str, bytes]]:
         "negative shape": (text, no_arrays(x=npy((-1, -8), bytes(64)))),
         "texts": (text, no_arrays(x=npy((8,), bytes(64), "<U2"))),
     }
+    return [written(folder / f"{kind}.zip", *given) for kind, given in kinds.items()]
 
 
-def test_archives_are_refused(honest: Document, tmp_path: Path) -> None:
-    for kind, (document, arrays) in archives(honest).items():
-        path = written(tmp_path / f"{kind}.zip", document, arrays)
+def test_archives_are_refused(archives: list[Path]) -> None:
+    for path in archives:
         with pytest.raises(FileFormatError, match=re.escape(str(path))):
             MPCPolicy.load(path)
 
@@ -217,9 +219,8 @@ print((after.ru_maxrss - before.ru_maxrss) // 1024)
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the unit of ru_maxrss")
-def test_refusing_takes_no_memory(honest: Document, tmp_path: Path) -> None:
-    paths = [str(written(tmp_path / f"{i}.zip", *given)) for i, given in enumerate(archives(honest).values())]
-    done = subprocess.run([sys.executable, "-c", BOMB, *paths], capture_output=True, text=True, check=True)
+def test_refusing_takes_no_memory(archives: list[Path]) -> None:
+    done = subprocess.run([sys.executable, "-c", BOMB, *map(str, archives)], capture_output=True, text=True, check=True)
     assert int(done.stdout) < 300  # MB
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from mpc_problems import PENDULUM
+from task_ids import PENDULUM
 
 from mpcoffline import MPCPolicy
 from mpcoffline.control.export import export_c
@@ -138,15 +140,55 @@ def test_what_killed_writers_left_goes_with_the_next_one(tmp_path: Path) -> None
     (left,) = tmp_path.glob(".p.zip.*")
     for path in others:
         path.touch()
-    old = 1e9
     with replaced(target) as file:
-        assert left.exists()  # it could be somebody's who has just begun
-        (own,) = set(tmp_path.glob(".p.zip.*")) - {left, others[0]}
-        os.utime(left, (old, old))
-        os.utime(own, (old, old))
-        write_file(target, b"first")
         assert not left.exists()
+        (own,) = set(tmp_path.glob(".p.zip.*")) - {others[0]}
+        write_file(target, b"first")
         assert own.exists()  # its writer lives
         file.write(b"second")
     assert target.read_bytes() == b"second"
     assert sorted(tmp_path.iterdir()) == sorted([target, *others])
+
+
+def test_what_is_no_file_is_not_taken_for_what_a_writer_left(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / ".p.zip.0123456789ab")  # to open it would wait for ever
+    (tmp_path / ".p.zip.0123456789ac").symlink_to(tmp_path / ".p.zip.0123456789ab")
+    write_file(tmp_path / "p.zip", b"content")
+    assert len(os.listdir(tmp_path)) == 3
+
+
+def test_a_complete_file_is_not_taken_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def replace(temporary: Path, target: Path) -> None:
+        monkeypatch.undo()
+        write_file(target, b"another writer's")
+        os.replace(temporary, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    write_file(tmp_path / "p.zip", b"content")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"content"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o755])
+def test_permissions_stay(tmp_path: Path, mode: int) -> None:
+    write_file(tmp_path / "p.zip", b"first")
+    (tmp_path / "p.zip").chmod(mode)
+    write_file(tmp_path / "p.zip", b"second")
+    assert stat.S_IMODE((tmp_path / "p.zip").stat().st_mode) == mode
+
+
+def test_a_file_that_is_taken_before_it_has_its_lock_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[Path] = []
+
+    def flock(file: Any, operation: int) -> None:
+        if not taken:
+            taken.append(Path(file.name))
+            taken[0].unlink()
+        real(file, operation)
+
+    real = fcntl.flock
+    monkeypatch.setattr(fcntl, "flock", flock)
+    write_file(tmp_path / "p.zip", b"content")
+    assert taken
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"content"]

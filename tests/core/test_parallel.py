@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mpcoffline.core import parallel
-from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 
 
 # Spawned workers import functions by module name; this module is not importable there, so jobs are built-ins.
@@ -49,8 +49,22 @@ def test_an_error_names_the_job_and_carries_the_traceback(workers: int) -> None:
 
 
 def test_a_process_that_dies_names_its_job() -> None:
-    with pytest.raises(parallel.JobError, match=r"job '(dies|too)'.*ended with code 3"):
+    with pytest.raises(parallel.JobError, match=r"job '(dies|too)'.*ended with code 3, as another before"):
         parallel.map(os._exit, {"dies": 3, "too": 3}, workers=2)
+
+
+def test_a_job_whose_process_dies_is_done_again(tmp_path: Path) -> None:
+    """The first process that finds no mark leaves one and dies."""
+    mark = tmp_path / "mark"
+    once = (
+        f"__import__('os').path.exists({str(mark)!r}) or (open({str(mark)!r}, 'w').close(), __import__('os')._exit(9))"
+    )
+    assert parallel.map(eval, {"a": "1", "dies once": once, "b": "2"}, workers=2) == [1, True, 2]
+
+
+def test_other_executors_are_unknown() -> None:
+    with pytest.raises(UnknownIdError, match="executor: expected one of processes, serial"):
+        parallel.map(abs, [1, 2], workers=2, executor="cluster")
 
 
 def test_a_result_that_cannot_be_pickled_is_an_error_of_its_job() -> None:
@@ -76,11 +90,12 @@ def test_ctrl_c_ends_all_processes_and_shows_one_traceback(tmp_path: Path) -> No
     script.write_text(
         textwrap.dedent("""
         import signal
-        from mpcoffline import parallel
+        from mpcoffline.core import parallel
         if __name__ == "__main__":
             # A shell that starts tests in the background leaves them deaf to Ctrl-C.
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            job = "[print('started', flush=True), __import__('time').sleep(60.0)]"
+            # One write a line: print may take two, between which that of the other process comes.
+            job = r"[__import__('os').write(1, b'started\\n'), __import__('time').sleep(60.0)]"
             parallel.map(eval, [job, job], workers=2)
         """)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -92,3 +93,27 @@ def test_a_lock_that_comes_late_keeps_its_folder(tmp_path: Path) -> None:
     with FileLock(late / ".lock"):
         remove_abandoned(found)
         assert (late / ".lock").exists()
+
+
+def test_a_removal_that_is_killed_leaves_what_the_next_one_removes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed = builder(tmp_path)
+    killed.kill()
+    killed.communicate()
+    (left,) = abandoned(tmp_path)
+    calls: list[str] = []
+    rmtree = shutil.rmtree
+
+    def once(path: Path, **options: bool) -> None:
+        if calls:
+            raise KeyboardInterrupt
+        calls.append(path.name)
+        rmtree(path, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", once)
+        with pytest.raises(KeyboardInterrupt):
+            remove_abandoned(left)
+    assert calls == ["content"]
+    assert abandoned(tmp_path) == [left]

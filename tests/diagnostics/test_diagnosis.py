@@ -25,7 +25,7 @@ WRONG = lq_plant.make_mpc((lq_plant.A, -0.5 * lq_plant.B))
 
 def fitted(mpc: MPC, table: TransitionTable = LOG) -> OfflineMPCLearner:
     value = QuadraticValue(lq_plant.BEST.P)
-    learner = OfflineMPCLearner(mpc, preset="paper", init="identified", value_function=value, fit_n_steps=1, trim=1.0)
+    learner = OfflineMPCLearner(mpc, method="bellman", init="identified", value_function=value, fit_n_steps=1, trim=1.0)
     learner.fit(table, show_progress=False)
     return learner
 

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.envs import ENV_IDS, CartPoleSwingUpEnv, ControlTask, LinearTrackingEnv, PendulumSwingUpEnv
 from mpcoffline.envs.base import wrap_angle
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 
 
 def make(env_id: str, **kwargs: Any) -> ControlTask:

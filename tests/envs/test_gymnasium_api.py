@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
 import warnings
 from typing import Any
@@ -13,10 +14,10 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.envs import ENV_IDS, ControlTask
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 A = [[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.8, 0.0], [0.0, 0.0, 0.0, 0.8]]
 
 PLANTS: dict[str, dict[str, Any]] = {
@@ -149,9 +150,9 @@ def test_the_documentation_page_is_complete(env_id: str) -> None:
         *("Episode End", "Arguments", "Info", "Version History", "References"),
     ]
     arguments = page.split("## Arguments")[1].split("## Info")[0]
-    parameters = list(type(plant).__init__.__annotations__)
+    parameters = list(inspect.signature(type(plant)).parameters)
     documented = [line.split("`")[1] for line in arguments.splitlines() if line.strip().startswith("| `")]
-    assert documented == [name for name in parameters if name != "return"]
+    assert documented == parameters
     assert f"Box({plant.action_space.low[0]}, {plant.action_space.high[0]}, {plant.action_space.shape}" in page
     rows = page.split("## State Space")[1].split("## Rewards")[0]
     assert "`state_space`" in rows

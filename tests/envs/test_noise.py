@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.envs import ENV_IDS, ControlTask
 from mpcoffline.envs.base import wrap_angle
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 SCALES = {LINEAR: [0.1, 0.2, 0.3, 0.4], PENDULUM: [0.1, 0.2], CARTPOLE: [0.1, 0.2, 0.3, 0.4]}
 
 

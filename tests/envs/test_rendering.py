@@ -12,12 +12,12 @@ import numpy as np
 import pygame
 import pytest
 from numpy.typing import NDArray
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.envs import ENV_IDS, ControlTask
 from mpcoffline.envs import rendering as style
 from mpcoffline.envs.rendering import Canvas, refined, signed, ticks
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 CAPTION = 44
 HANG = float(np.pi)
 

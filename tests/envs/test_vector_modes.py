@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.envs.pendulum_swing_up import PendulumSwingUpVectorEnv
 from mpcoffline.envs.vector import ControlTaskVectorEnv
 
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 MODES = ("NextStep", "SameStep", "Disabled")
 NOISE: dict[str, Any] = {"process_noise": 0.02, "measurement_noise": 0.05}
 CASES = [

@@ -66,6 +66,7 @@ def test_deviations_are_those_of_the_linear_regression() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize(("task", "env_id"), [("pendulum", "PendulumSwingUp"), ("cartpole", "CartPoleSwingUp")])
+@pytest.mark.usefixtures("shipped")
 def test_the_swing_ups_parameters_are_found_from_far_away(task: str, env_id: str, seed: int) -> None:
     env_id = f"mpcoffline/{env_id}-v0"
     table = TransitionTable.from_minari(f"mpcoffline/{task}/ddpg-v0")
@@ -207,6 +208,7 @@ def test_units_do_not_matter(log_x: float, log_u: float, seed: int) -> None:
     assert scaled.error_after == pytest.approx(plain.error_after, rel=1e-3)
 
 
+@pytest.mark.usefixtures("shipped")
 def test_the_same_seed_gives_the_same_bits() -> None:
     table = TransitionTable.from_minari("mpcoffline/pendulum/ddpg-v0")
     mpc = nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=3)

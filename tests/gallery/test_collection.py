@@ -16,11 +16,11 @@ import torch
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.datasets.recipes import TASKS, Recipe
+from mpcoffline.datasets.recipes import Recipe, recorded_tasks
 from mpcoffline.datasets.store.packed import packed_size
-from mpcoffline.envs import ControlTask
+from mpcoffline.envs import PLANTS, ControlTask
 from mpcoffline.gallery import collect
-from mpcoffline.gallery.cards import PANELS, coverage_figure, return_figure, write_card
+from mpcoffline.gallery.cards import coverage_figure, panels_of, return_figure, write_card
 from mpcoffline.gallery.collection import collect_with, make_agent, return_curve, score_agent
 from mpcoffline.gallery.shipping import make_shipped
 
@@ -33,7 +33,7 @@ def quick(task: str, steps: int = 300) -> Recipe:
     return replace(recipe, hidden=(8,), hyperparameters={**recipe.hyperparameters, "learning_starts": 50})
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", recorded_tasks())
 def test_what_is_collected_is_raw(task: str) -> None:
     recipe = quick(task)
     dataset, _ = collect_with(recipe, progress=False)
@@ -62,7 +62,7 @@ def test_the_same_seed_gives_the_same_data() -> None:
     assert not np.array_equal(first, other)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", recorded_tasks())
 def test_the_agent_sees_scaled_observations_and_rewards(task: str) -> None:
     recipe = Recipe.load(task)
     agent = make_agent(recipe)
@@ -163,7 +163,7 @@ def test_scores_are_those_of_the_environment() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", recorded_tasks())
 def test_a_card_says_what_the_data_are(task: str, tmp_path: Path) -> None:
     recipe = quick(task)
     dataset, agent = collect_with(recipe, progress=False)
@@ -186,7 +186,9 @@ def test_figures_hold_the_numbers() -> None:
     assert axes.get_yscale() == "linear"
     assert return_figure(np.r_[1e5, costs], []).axes[0].get_yscale() == "log"
     rng = np.random.default_rng(0)
-    figure = coverage_figure(PANELS["pendulum"], rng.uniform(-1, 1, (1000, 2)), rng.uniform(-2, 2, (1000, 1)))
+    figure = coverage_figure(
+        panels_of(PLANTS["pendulum"]), rng.uniform(-1, 1, (1000, 2)), rng.uniform(-2, 2, (1000, 1))
+    )
     counts = [axes.collections[0].get_array() for axes in figure.axes[:2]]
     assert [int(count.sum()) for count in counts] == [1000, 1000]
 
@@ -204,7 +206,7 @@ def test_one_call_makes_all_that_is_shipped(tmp_path: Path, monkeypatch: pytest.
 def test_the_command_explains_itself_and_refuses_an_unknown_task() -> None:
     command = [sys.executable, str(ROOT / "scripts" / "make_datasets")]
     shown = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True).stdout
-    assert all(task in shown for task in TASKS)
+    assert all(task in shown for task in recorded_tasks())
     result = subprocess.run([*command, "pendulm"], capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert "Did you mean 'pendulum'" in result.stderr

@@ -46,6 +46,7 @@ def test_the_numbers_are_those_of_the_data(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_a_shipped_data_set_has_its_card() -> None:
     summary = show("mpcoffline/pendulum/ddpg-v0")
     assert summary.card == catalog_file("pendulum.md").read_text(encoding="utf-8")

@@ -1,12 +1,34 @@
-"""A tiny MPC to compile, and programs to be $CC."""
+"""A tiny MPC to compile, quickly where its speed does not matter, and programs to be $CC."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.solvers.ddp import build
 
 STATE = [[1.5]]
+SHIPPED_FLAGS = build.FLAGS
+QUICK_FLAGS = tuple("-O0" if flag == "-O3" else flag for flag in SHIPPED_FLAGS)
+
+
+_REMEMBERED = (build._target, build.trial)
+
+
+@contextmanager
+def compiled_with(flags: tuple[str, ...]) -> Iterator[None]:
+    """Solvers are compiled with these flags."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "FLAGS", flags)
+        for answers in _REMEMBERED:
+            answers.cache_clear()
+        yield
+    for answers in _REMEMBERED:
+        answers.cache_clear()
 
 
 def tiny(weight: float = 1.0, factor: float = 1.0) -> MPC:

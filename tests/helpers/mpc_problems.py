@@ -7,13 +7,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from task_ids import LINEAR, PENDULUM
 
-from mpcoffline.envs import ENV_IDS
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.solvers import Solution
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 
 
 def random_states(env_id: str, n: int, seed: int = 0, speed: float = 3.0) -> Array:

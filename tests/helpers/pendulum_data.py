@@ -10,8 +10,9 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
-from mpcoffline.datasets.store.local import dataset_path, write_dataset
+from mpcoffline.datasets.store.ids import dataset_path
 from mpcoffline.datasets.store.manifest import write_manifest
+from mpcoffline.datasets.store.writing import write_dataset
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 

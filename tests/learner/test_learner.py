@@ -18,6 +18,7 @@ from minari.data_collector import EpisodeBuffer
 
 import mpcoffline.control.policy
 import mpcoffline.solvers
+from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import (
     FileFormatError,
     InvalidArgumentError,
@@ -26,7 +27,7 @@ from mpcoffline.core.errors import (
     UnknownIdError,
 )
 from mpcoffline.datasets import TransitionTable, load_dataset
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learner.presets import PRESETS
 from mpcoffline.learning import ValueFunction
@@ -34,7 +35,6 @@ from mpcoffline.mpc import MPC
 from mpcoffline.plants.nominal import nominal_mpc
 
 QUICK: dict[str, Any] = {
-    "preset": "paper",
     "hidden": (16, 16),
     "value_n_steps": 60,
     "value_batch_size": 64,
@@ -52,7 +52,8 @@ def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def quick(mpc: MPC | None = None, **options: Any) -> OfflineMPCLearner:
-    return OfflineMPCLearner(mpc or make_mpc(), **(QUICK | options))
+    how = {} if "preset" in options else {"method": "bellman"}  # whose options are the published ones
+    return OfflineMPCLearner(mpc or make_mpc(), **(QUICK | how | options))
 
 
 def fitted(table: TransitionTable | None = None, **options: Any) -> OfflineMPCLearner:
@@ -248,10 +249,12 @@ def test_tables_larger_than_memory_are_learned_from(preset: str, tmp_path: Path)
     mapped = TransitionTable.from_minari(dataset, memory=2_000, cache=tmp_path / "tables")
     assert mapped.is_mapped
     mpc = nominal_mpc("mpcoffline/LinearTracking-v0").replace(horizon=5)
-    learner = quick(mpc, preset=preset, terminal="quadratic", fit_n_steps=5, trim=1.0)
+    options: dict[str, Any] = {"fit_n_steps": 5, "trim": 1.0, "preset": preset}
+    options |= {} if preset == "paper" else {"terminal": "quadratic"}
+    learner = quick(mpc, **options)
     learner.fit(mapped, show_progress=False)
     assert np.isfinite(learner.theta).all()
-    in_memory = quick(mpc, preset=preset, terminal="quadratic", fit_n_steps=5, trim=1.0)
+    in_memory = quick(mpc, **options)
     in_memory.fit(dataset, show_progress=False)
     # Rows are shuffled block by block: other minibatches, the same problem.
     np.testing.assert_allclose(learner.mpc.values["model.A"], in_memory.mpc.values["model.A"], atol=0.2)
@@ -276,9 +279,9 @@ def test_learning_solves_no_mpc(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_preset_is_the_default_one() -> None:
-    assert OfflineMPCLearner(make_mpc()).config == PRESETS["default"]
-    assert OfflineMPCLearner(make_mpc(), value="td", horizon=7).config == PRESETS["default"].replaced(
-        {"method": "td", "horizon": 7}
+    assert OfflineMPCLearner(make_mpc()).method == PRESETS["default"]
+    assert OfflineMPCLearner(make_mpc(), value="td", horizon=7).method == PRESETS["default"].replaced(
+        {"value": "td", "horizon": 7}
     )
 
 
@@ -288,13 +291,17 @@ def test_the_preset_is_the_default_one() -> None:
         ({"learn": "model"}, InvalidArgumentError, r"learn: expected 'cost' or 'cost\+model', got 'model'"),
         ({"preset": "papr"}, UnknownIdError, "Did you mean 'paper'"),
         ({"value": "expectil"}, UnknownIdError, "Did you mean 'expectile'"),
-        ({"priors": 1.0}, UnknownIdError, "option of OfflineMPCLearner: .*Did you mean 'prior'"),
+        ({"priors": 1.0}, UnknownIdError, "option of the learning method Bellman: .*Did you mean 'prior'"),
         ({"n_steps": 5}, UnknownIdError, "value_n_steps|fit_n_steps"),
         ({"prior": -1.0}, InvalidArgumentError, "prior"),
         ({"trim": 0.0}, InvalidArgumentError, "trim"),
         ({"trim": 1.5}, InvalidArgumentError, "trim"),
         ({"seed": -1}, InvalidArgumentError, "seed: expected an integer >= 0, got -1"),
         ({"seed": 0.5}, InvalidArgumentError, "seed"),
+        ({"method": "papr"}, UnknownIdError, "learning method: .*Did you mean 'paper'"),
+        ({"method": "paper", "preset": "paper"}, InvalidArgumentError, "preset: expected none beside a method"),
+        ({"preset": "paper", "init": "identified"}, UnknownIdError, "option of the learning method Paper: .*'init'"),
+        ({"method": "bellman", "potential": True}, InvalidArgumentError, "got terminal='given'"),
         ({"preset": "paper", "potential": True}, InvalidArgumentError, "potential: expected a terminal cost from V"),
         ({"value_function": lq_plant.QuadraticValue(np.eye(3))}, InvalidArgumentError, "value_function: .* 2 coord"),
     ],
@@ -312,7 +319,7 @@ def test_an_unknown_device_is_refused_before_the_work() -> None:
 def test_numpy_numbers_can_be_saved(tmp_path: Path) -> None:
     learner = quick(prior=np.float32(0.5), horizon=np.int64(7))
     learner.save(tmp_path / "l.zip")
-    assert OfflineMPCLearner.load(tmp_path / "l.zip").config == learner.config
+    assert OfflineMPCLearner.load(tmp_path / "l.zip").method == learner.method
 
 
 def test_before_fit_there_is_nothing_to_hand_out() -> None:
@@ -465,7 +472,7 @@ def test_a_saved_learner_is_the_same_learner(tmp_path: Path) -> None:
     learner.save(tmp_path / "l.zip")
     loaded = OfflineMPCLearner.load(tmp_path / "l.zip")
     same_fit(learner, loaded)
-    assert loaded.config == learner.config
+    assert loaded.method == learner.method
     assert (loaded.learn, loaded.preset, loaded.seed) == (learner.learn, learner.preset, learner.seed)
     assert loaded.result is not None
     assert learner.result is not None
@@ -517,6 +524,9 @@ def test_the_environments_observation_space_is_kept(tmp_path: Path) -> None:
     learner.fit(dataset, show_progress=False)
     learner.save(tmp_path / "l.zip")
     assert OfflineMPCLearner.load(tmp_path / "l.zip").policy.observation_space == dataset.observation_space
+    policy = MPCPolicy.load(tmp_path / "l.zip")  # a learner's file has its policy
+    assert policy.observation_space == dataset.observation_space
+    assert policy.mpc.theta.tolist() == learner.theta.tolist()
 
 
 def test_saving_over_a_learner_replaces_it(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,30 +10,41 @@ import pytest
 from lq_plant import make_mpc
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
-from mpcoffline.learner.fitting import restructured
-from mpcoffline.learner.presets import PRESETS, LearnerConfig
-from mpcoffline.learning import FitConfig, ValueConfig
+from mpcoffline.learner.presets import PRESETS
+from mpcoffline.learning import METHODS, Bellman, Paper, ParameterConfig, ValueConfig
 from mpcoffline.plants.nominal import nominal_mpc
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 
 
 def test_overrides_reach_their_field() -> None:
-    overrides = {"method": "expectile", "tau": 0.1, "prior": 0.5, "value_n_steps": 7, "fit_n_steps": 9, "trim": 0.8}
-    assert LearnerConfig().replaced(overrides | {"hidden": (3,), "horizon": 5}) == LearnerConfig(
+    overrides = {"value": "expectile", "tau": 0.1, "prior": 0.5, "value_n_steps": 7, "fit_n_steps": 9, "trim": 0.8}
+    assert Paper().replaced(overrides | {"hidden": (3,), "horizon": 5}) == Paper(
         0.8,
         horizon=5,
         value=ValueConfig(method="expectile", tau=0.1, n_steps=7, hidden=(3,)),
-        fit=FitConfig(prior=0.5, n_steps=9),
+        fit=ParameterConfig(prior=0.5, n_steps=9),
     )
 
 
 def test_the_paper_preset_changes_nothing_of_the_mpc() -> None:
     mpc = nominal_mpc(PENDULUM)
-    assert restructured(mpc, PRESETS["paper"]).to_json() == mpc.to_json()
-    assert PRESETS["paper"].value.method == "residual"
-    assert PRESETS["paper"].fit.prediction_weight == 0.0
-    assert PRESETS["paper"].init == "nominal"
+    assert PRESETS["paper"].restructured(mpc).to_json() == mpc.to_json()
+    options = PRESETS["paper"].options
+    assert (options["value"], options["prediction_weight"], options["fit_n_steps"]) == ("residual", 0.0, 1_000)
+    assert list(PRESETS["paper"].stages()) == ["value", "fit"]
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_option_has_one_spelling_and_each_comes_back(name: str) -> None:
+    method = METHODS[name]()
+    options = method.options
+    assert method.replaced(options) == method
+    for stage, field in (("value", "tau"), ("value", "method"), ("fit", "prior"), ("terminal", "method")):
+        with pytest.raises(UnknownIdError, match="option of the learning method"):
+            method.replaced({f"{stage}_{field}": 1})
+    assert {"value", "value_n_steps", "fit_n_steps", "tau", "prior", "discount"} <= set(options)
+    assert ("terminal" in options) == ("init" in options) == (name == "bellman")
 
 
 @pytest.mark.parametrize(
@@ -43,20 +53,20 @@ def test_the_paper_preset_changes_nothing_of_the_mpc() -> None:
 )
 def test_the_other_presets_have_a_least_discount(preset: str, given: float, discount: float) -> None:
     mpc = make_mpc().replace(discount=given)
-    assert restructured(mpc, PRESETS[preset]).discount == discount
-    assert restructured(mpc, PRESETS[preset].replaced({"discount": 0.8})).discount == 0.8
+    assert PRESETS[preset].restructured(mpc).discount == discount
+    assert PRESETS[preset].replaced({"discount": 0.8}).restructured(mpc).discount == 0.8
     assert mpc.discount == given
 
 
 def test_horizons_are_those_of_the_preset() -> None:
-    horizons = {name: restructured(nominal_mpc(PENDULUM), config).horizon for name, config in PRESETS.items()}
+    horizons = {name: method.restructured(nominal_mpc(PENDULUM)).horizon for name, method in PRESETS.items()}
     assert horizons["paper"] == 50
     assert horizons["fast"] <= 10 < horizons["default"] <= horizons["best"]
 
 
 def test_a_cross_term_leaves_the_cost_as_it_is_until_it_is_fitted() -> None:
     mpc = make_mpc()
-    crossed = restructured(mpc, LearnerConfig(cross_term=True))
+    crossed = Paper(cross_term=True).restructured(mpc)
     assert "stage_cost.H" in crossed.values
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -67,8 +77,8 @@ def test_a_cross_term_leaves_the_cost_as_it_is_until_it_is_fitted() -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_configurations_survive_json(name: str) -> None:
-    config = PRESETS[name].replaced({"hidden": (8, 9), "horizon": 3})
-    assert LearnerConfig.from_json(json.loads(json.dumps(asdict(config)))) == config
+    method = PRESETS[name].replaced({"hidden": (8, 9), "horizon": 3})
+    assert METHODS[method.name]().replaced(json.loads(json.dumps(method.options))) == method
 
 
 @pytest.mark.parametrize(
@@ -78,11 +88,11 @@ def test_configurations_survive_json(name: str) -> None:
         ({"init": "identify"}, UnknownIdError, "Did you mean 'identified'"),
         ({"horizon": 0}, InvalidArgumentError, "horizon"),
         ({"discount": 1.5}, InvalidArgumentError, "discount"),
-        ({"terminal_blend": -0.1}, InvalidArgumentError, "terminal_blend"),
+        ({"blend": -0.1}, InvalidArgumentError, "blend"),
         ({"prediction_weight": -1.0}, InvalidArgumentError, "prediction_weight"),
-        ({"n_step": 3}, UnknownIdError, "option of OfflineMPCLearner"),
+        ({"n_step": 3}, UnknownIdError, "option of the learning method Bellman"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        LearnerConfig().replaced(options)
+        Bellman().replaced(options)

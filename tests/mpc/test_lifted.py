@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.learning import FitConfig, fit_parameters
+from mpcoffline.learning import ParameterConfig, fit_parameters
 from mpcoffline.mpc import MPC, LiftedCost, Model, NormCost, QuadraticCost, polynomial_features
-from mpcoffline.mpc.cost import cost_from_json
+from mpcoffline.mpc.component import cost_from_json
 from mpcoffline.mpc.torch_twin import TorchTwin
 from mpcoffline.solvers import make_solver
 
@@ -143,7 +143,9 @@ def test_fit_recovers_the_weights() -> None:
     costs = 2.0 * (x[:, 0] ** 2 - 0.25) ** 2 + x[:, 1] ** 2 + 0.5 * u[:, 0] ** 2 + 0.3
     table = TransitionTable.from_arrays(x, u, costs, x, np.zeros(len(x)))
     mpc = problem(LiftedCost.of(QuadraticCost(np.eye(2), [[1.0]], x_ref=x_ref), polynomial_features(2)))
-    result = fit_parameters(mpc, QuadraticValue(np.zeros((2, 2))), table, ("cost",), FitConfig(prior=1e-9), seed=0)
+    result = fit_parameters(
+        mpc, QuadraticValue(np.zeros((2, 2))), table, ("cost",), ParameterConfig(prior=1e-9), seed=0
+    )
     assert result.loss_after < 1e-5 * result.loss_before
     fitted = mpc.with_theta(result.theta).stage_cost
     L = functions(fitted, 2, 1)[0]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.learning import FitConfig, fit_parameters
+from mpcoffline.learning import ParameterConfig, fit_parameters
 from mpcoffline.mpc import MPC, ConvexNetworkCost, Model, NetworkCost, NormCost, QuadraticCost
-from mpcoffline.mpc.cost import cost_from_json
+from mpcoffline.mpc.component import cost_from_json
 from mpcoffline.mpc.torch_twin import TorchTwin
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import make_solver
@@ -250,7 +250,7 @@ def test_fit_learns_a_convex_cost() -> None:
     costs = np.hypot(1.0, x[:, 0]) + np.logaddexp(0.0, 2.0 * x[:, 1] - u[:, 0]) + 0.1 * u[:, 0] ** 2
     table = TransitionTable.from_arrays(x, u, costs, x, np.zeros(len(x)))
     model = Model(lambda x, u, p: lq_plant.A @ x + lq_plant.B @ u, nx=2, nu=1, dt=0.1, discrete=True)
-    config, value = FitConfig(prior=1e-7, refit_iterations=100), lq_plant.QuadraticValue(np.zeros((2, 2)))
+    config, value = ParameterConfig(prior=1e-7, refit_iterations=100), lq_plant.QuadraticValue(np.zeros((2, 2)))
     errors = []
     for cost in (QuadraticCost(np.eye(2), [[1.0]], [[0.0], [0.0]]), ConvexNetworkCost.random(2, 1, (4,), seed=0)):
         mpc = MPC(model, cost, NormCost([0.0, 0.0]), 3, 0.9, [-1.0], [1.0])

@@ -8,14 +8,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
-from mpcoffline.envs import ENV_IDS
-from mpcoffline.plants.nominal import CARTPOLE_PARAMETERS, PENDULUM_PARAMETERS, nominal_mpc
+from mpcoffline.envs import ENV_IDS, PLANTS
+from mpcoffline.plants.nominal import nominal_mpc
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
-SPREADS = {PENDULUM: PENDULUM_PARAMETERS, CARTPOLE: CARTPOLE_PARAMETERS}
+SPREADS = {plant.id: [p for p in plant.parameters if p.spread] for plant in PLANTS.values()}
+UNCERTAIN = [env_id for env_id, parameters in SPREADS.items() if parameters]
 
 
 def plant_of(env_id: str, **arguments: Any) -> Any:
@@ -98,7 +99,7 @@ def test_the_state_of_the_mpc_is_the_observation(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", [PENDULUM, CARTPOLE])
 def test_a_seed_is_one_draw_that_alpha_scales(env_id: str) -> None:
-    true = np.array([p.true for p in SPREADS[env_id]])
+    true = np.array([p.value for p in SPREADS[env_id]])
     spread = np.array([p.spread for p in SPREADS[env_id]])
     for seed in range(20):
         error = model_parameters(env_id, 1.0, seed) - true
@@ -114,8 +115,8 @@ def test_a_seed_is_one_draw_that_alpha_scales(env_id: str) -> None:
 
 
 def test_published_spreads() -> None:
-    assert [(p.name, p.true, p.spread) for p in PENDULUM_PARAMETERS] == [("m", 1.0, 0.5), ("l", 1.0, 0.5)]
-    assert [(p.name, p.true, p.spread) for p in CARTPOLE_PARAMETERS] == [
+    assert [(p.name, p.value, p.spread) for p in SPREADS[PENDULUM]] == [("m", 1.0, 0.5), ("l", 1.0, 0.5)]
+    assert [(p.name, p.value, p.spread) for p in SPREADS[CARTPOLE]] == [
         *(("m_c", 0.2, 0.1), ("mu", 0.5, 0.25), ("m_p", 0.2, 0.1), ("l", 0.5, 0.25))
     ]
 

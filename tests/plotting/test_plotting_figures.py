@@ -9,17 +9,16 @@ import matplotlib.colors
 import numpy as np
 import pytest
 
-import mpcoffline
 from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, QuadraticCost, nominal_mpc, plotting
 from mpcoffline.control.evaluation import Evaluation
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
+from mpcoffline.envs import PLANTS
 from mpcoffline.learning import FitResult
 from mpcoffline.plotting import style
 from mpcoffline.plotting.costs import stage_weights
-from mpcoffline.plotting.panels import TASKS, on_plane, task_of
+from mpcoffline.plotting.panels import on_plane, plane_of, task_of
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
-SIZES = {"LinearTracking": (4, 2), "PendulumSwingUp": (2, 1), "CartPoleSwingUp": (4, 1)}
 
 
 def loops_of(states: np.ndarray, actions: np.ndarray) -> Evaluation:
@@ -27,13 +26,14 @@ def loops_of(states: np.ndarray, actions: np.ndarray) -> Evaluation:
     return Evaluation(one, one, one > 0, np.array([len(actions)]), 0.9, [states], [actions])
 
 
-@pytest.mark.parametrize("task", SIZES)
-def test_closed_loops_show_states_and_inputs_with_their_bounds(task: str) -> None:
-    nx, nu = SIZES[task]
+@pytest.mark.parametrize("name", PLANTS)
+def test_closed_loops_show_states_and_inputs_with_their_bounds(name: str) -> None:
+    plant = PLANTS[name]
+    nx, nu = len(plant.states), len(plant.inputs)
     rng = np.random.default_rng(0)
     loops = {name: loops_of(rng.normal(size=(51, nx)), rng.uniform(-2, 2, (50, nu))) for name in ("MPC_1", "MPC_3")}
-    figure = plotting.loop_figure(loops, f"mpcoffline/{task}-v0")
-    assert len(figure.axes) == len(TASKS[f"mpcoffline/{task}-v0"].states) + nu
+    figure = plotting.loop_figure(loops, plant.id)
+    assert len(figure.axes) == len(plant.shown) + nu
     assert all("(" in axes.get_ylabel() for axes in figure.axes), "every axis names its unit"
     assert figure.axes[-1].get_xlabel() == "time (s)"
 
@@ -68,7 +68,7 @@ def test_the_plane_of_the_pendulum_holds_its_cost() -> None:
     """With W = diag(1, 1, 0.1) at [1, 0, 0]: (cos - 1)^2 + sin^2 + 0.1 phid^2 = 2 - 2 cos + 0.1 phid^2."""
     nominal = nominal_mpc(PENDULUM)
     cost = lambda y: np.array(nominal.stage_function(y.T, np.zeros((1, len(y))), nominal.theta).full()[0])  # noqa: E731
-    angle, speed, values = on_plane(*task_of(PENDULUM), cost, n=7)
+    angle, speed, values = on_plane(task_of(PENDULUM)[0], plane_of(PLANTS["pendulum"]), cost, n=7)
     np.testing.assert_allclose(values, 2 - 2 * np.cos(angle) + 0.1 * speed**2, atol=1e-5)
 
 
@@ -194,9 +194,8 @@ class TestFilms:
 
 
 def test_the_labels_fit_the_environments() -> None:
-    for env_id, labels in TASKS.items():
-        task, _ = task_of(env_id)
-        assert len(labels.observations) == task.observation_space.shape[0]
-        assert len(labels.actions) == task.action_space.shape[0]
-        assert all(c.index < task.state_space.shape[0] for c in (*labels.states, *labels.plane))
-    assert set(TASKS) == set(mpcoffline.envs.ENV_IDS)
+    for plant in PLANTS.values():
+        task, found = task_of(plant.id)
+        assert found is plant
+        assert len(plant.observations) == task.observation_space.shape[0]
+        assert [c.index for c in plane_of(plant)] == [plant.state(name).index for name in plant.plane]

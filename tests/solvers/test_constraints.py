@@ -184,14 +184,14 @@ def test_the_violated_constraint_is_named(constraints: Any, named: str) -> None:
     assert solution.success.tolist() == [False]
     assert solution.stats["violation"][0] > 0.1
     with pytest.raises(AssertionError, match=named):
-        raise AssertionError(solution.status[0])
+        raise AssertionError(solution.words[0])
 
 
 def test_an_imposed_input_that_breaks_a_constraint() -> None:
     mpc = double_integrator(constraints=Constraint(lambda x, u, p: u - 1.0, "gentle"))
     solution = IpoptSolver(mpc).solve([[1.0, 0.0]] * 2, u0=[[1.5], [0.5]])
     assert solution.success.tolist() == [False, True]
-    assert "'gentle' at stage 0 is violated by 0.5" in solution.status[0]
+    assert "'gentle' at stage 0 is violated by 0.5" in solution.words[0]
 
 
 # ---------------------------------------------------------------- success is decided by the trajectory
@@ -224,11 +224,11 @@ class _Claims:
 def test_a_false_claim_is_no_success(changes: dict[str, Any], expected: str) -> None:
     solver = IpoptSolver(double_integrator())
     assert solver.solve(START).success
-    program = solver._common
+    program = solver._programs.common
     program._cold, program._exact = _Claims(program._cold, **changes), _Claims(program._exact, **changes)
     solution = solver.solve(START)
     assert not solution.success
-    assert expected in solution.status[0]
+    assert expected in solution.words[0]
     assert solver.value(START) == np.inf
 
 
@@ -236,7 +236,7 @@ def test_a_solution_stopped_early_is_no_success() -> None:
     solver = IpoptSolver(double_integrator(), max_iterations=1)
     solution = solver.solve(START)
     assert not solution.success
-    assert solution.status[0].startswith("Maximum_Iterations_Exceeded: not optimal")
+    assert solution.words[0].startswith("Maximum_Iterations_Exceeded: not optimal")
 
 
 def test_the_trajectory_returned_is_the_models() -> None:

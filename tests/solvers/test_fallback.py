@@ -44,7 +44,7 @@ class Scripted(Solver):
 
 @pytest.fixture
 def scripted(monkeypatch: pytest.MonkeyPatch) -> MPCPolicy:
-    monkeypatch.setitem(SOLVERS, "scripted", Scripted)
+    monkeypatch.setitem(SOLVERS._things, "scripted", Scripted)
     monkeypatch.setattr(Scripted, "calls", [], raising=False)
     return MPCPolicy(lq_plant.make_mpc(action_low=[LOW], action_high=[HIGH]), "scripted")
 

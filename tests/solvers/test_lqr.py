@@ -86,7 +86,7 @@ def test_the_riccati_equation_of_scipy(alpha: float, horizon: int) -> None:
     s, a = rng.uniform(-0.3, 0.3, size=(50, 4)), rng.uniform(-4, 4, size=(50, 2))
     solution = solver.solve(s)
     assert solution.success.all()
-    assert set(solution.status) == {"Riccati"}
+    assert set(solution.words) == {"Riccati"}
     np.testing.assert_allclose(solution.value, np.einsum("bi,ij,bj->b", s, best.P, s), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(solution.u0, s @ best.K.T, rtol=0, atol=1e-9)
     z = np.hstack([s, a])
@@ -149,7 +149,7 @@ def test_horizon_100_with_active_bounds(alpha: float) -> None:
     x = np.random.default_rng(0).uniform(-6, 6, size=(5, 4))
     exact, found = LQRSolver(mpc).solve(x), oracle(mpc).solve(x)
     assert exact.success.all()
-    assert "QP" in exact.status
+    assert "QP" in exact.words
     assert (exact.stats["residual"] < 1e-10).all()
     assert np.abs(exact.u).max() == 10.0
     np.testing.assert_allclose(exact.value, found.value, rtol=1e-10)
@@ -201,7 +201,7 @@ def test_a_batch_equals_one_by_one() -> None:
     solver = LQRSolver(linear_mpc())
     x = np.random.default_rng(0).uniform(-2, 2, size=(6, 4))
     batch = solver.solve(x)
-    assert {"QP", "Riccati"} == set(batch.status)
+    assert {"QP", "Riccati"} == set(batch.words)
     for k in range(6):
         one = solver.solve(x[k])
         assert one.u0.shape == (2,)
@@ -273,7 +273,7 @@ def test_inputs_without_cost_or_effect_are_passed_to_ipopt() -> None:
     mpc = MPC(model, QuadraticCost([[1.0]]), QuadraticCost([[1.0]]), 3, 0.9, [-1.0] * 2, [1.0] * 2)
     solution = LQRSolver(mpc).solve([0.5])
     assert solution.success
-    assert "ipopt" in solution.status[0]
+    assert "ipopt" in solution.words[0]
     assert solution.value == pytest.approx(0.25, abs=1e-6)
 
 
@@ -295,7 +295,7 @@ def test_a_cost_that_is_not_convex_is_not_called_solved_by_riccati() -> None:
     model = Model(lambda x, u, p: x + u, 1, 1, 1.0, discrete=True)
     mpc = MPC(model, Saddle([[1.0]], [[1.0]]), QuadraticCost([[1.0]]), 2, 0.9, [-1.0], [1.0])
     solution = LQRSolver(mpc).solve([[0.5]])
-    assert solution.status[0].startswith("ipopt")
+    assert solution.words[0].startswith("ipopt")
     if solution.success[0]:  # a vertex of the box
         np.testing.assert_allclose(np.abs(solution.u), 1.0, atol=1e-6)
 

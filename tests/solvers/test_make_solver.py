@@ -67,7 +67,7 @@ def test_solvers_by_name() -> None:
         assert solver.solve([0.5]).value == pytest.approx(float(make_solver(integrator()).value([0.5])), rel=1e-7)
     with pytest.raises(UnknownIdError, match="Did you mean 'ipopt'"):
         make_solver(integrator(), "ipop")
-    with pytest.raises(InvalidArgumentError, match="linear-quadratic problem for the lqr solver, got a model"):
+    with pytest.raises(InvalidArgumentError, match="a problem that the lqr solver takes, got a model"):
         make_solver(integrator(**NONLINEAR), "lqr")
 
 
@@ -94,7 +94,7 @@ def test_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
         def __init__(self, mpc: MPC, *, max_iterations: int = 1, n_threads: int = 1) -> None:
             raise CompilerError("C compiler", expected="a working one", actual="none")
 
-    monkeypatch.setitem(solvers.SOLVERS, "ddp", Broken)
+    monkeypatch.setitem(solvers.SOLVERS._things, "ddp", Broken)
     assert make_solver(integrator()).name == "lqr"
     with pytest.warns(UserWarning, match="500 times slower than ddp: C compiler: expected a working one"):
         solver = make_solver(integrator(**NONLINEAR), n_threads=1)
@@ -102,3 +102,22 @@ def test_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "ddp has no compiler" in solver.reason
     with pytest.raises(CompilerError):
         make_solver(integrator(), "ddp")
+
+
+def test_a_registered_solver_takes_part_in_auto(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Eager(solvers.IpoptSolver):
+        relative_speed = 1e6
+
+        @classmethod
+        def refuses(cls, mpc: MPC) -> str:
+            return "long horizons" if mpc.horizon > 4 else ""
+
+    monkeypatch.setattr(solvers.SOLVERS, "_things", dict(solvers.SOLVERS.items()))
+    solvers.SOLVERS.add("eager", Eager)
+    chosen = make_solver(integrator())
+    assert type(chosen) is Eager
+    assert (chosen.name, chosen.reason) == ("eager", "eager is the fastest that fits")
+    longer = make_solver(integrator(horizon=5))
+    assert (longer.name, longer.reason) == ("lqr", "lqr is the fastest that fits; eager does not support long horizons")
+    with pytest.raises(InvalidArgumentError, match="mpc: expected a problem that the eager solver takes, got long"):
+        make_solver(integrator(horizon=5), "eager")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mpc_problems import PENDULUM, random_linear
+from mpc_problems import random_linear
+from task_ids import PENDULUM
 
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers.starts import N_CANDIDATES, SIZES, candidate_inputs

@@ -7,13 +7,15 @@ import pytest
 import torch
 
 from mpcoffline.learner.presets import PRESETS
-from mpcoffline.learning import FitConfig, ValueConfig
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.studies.comparison import CaseGroup, Row, groups, run_group, without
 
 BRIEF = {
-    "value": ValueConfig(n_steps=200, hidden=(32,)),
-    "fit": FitConfig(n_steps=10, batch_size=128, refit_rows=2_000, refit_iterations=30),
+    "value_n_steps": 200,
+    "hidden": (32,),
+    "fit_n_steps": 10,
+    "refit_rows": 2_000,
+    "refit_iterations": 30,
 }
 
 
@@ -22,13 +24,8 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Presets that learn little, and fast."""
     torch.set_num_threads(1)
     for name, config in list(PRESETS.items()):
-        changes = {f"value_{k}": getattr(BRIEF["value"], k) for k in ("n_steps", "hidden")}
-        changes |= {k: getattr(BRIEF["fit"], k) for k in ("refit_rows", "refit_iterations")}
-        if config.fit.n_steps:
-            changes |= {"fit_n_steps": 10}
-        if config.terminal != "given":
-            changes |= {"terminal": "quadratic"}
-        monkeypatch.setitem(PRESETS, name, config.replaced(changes))
+        changes = {"terminal": "quadratic"} if "terminal" in config.options else {}
+        monkeypatch.setitem(PRESETS, name, config.replaced(BRIEF | changes))
 
 
 @pytest.mark.slow

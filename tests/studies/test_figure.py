@@ -7,19 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mpcoffline.envs import PLANTS
 from mpcoffline.plotting import save_figure
 from mpcoffline.studies import ControllerResult, TaskResult
 from mpcoffline.studies.figure import main_job_figure
 
-ENVS = {
-    "linear": ("mpcoffline/LinearTracking-v0", 4, 2, 0.1),
-    "pendulum": ("mpcoffline/PendulumSwingUp-v0", 2, 1, 0.05),
-    "cartpole": ("mpcoffline/CartPoleSwingUp-v0", 4, 1, 0.05),
-}
-
 
 def made_up(task: str) -> TaskResult:
-    env_id, nx, nu, dt = ENVS[task]
+    plant = PLANTS[task]
+    nx, nu = len(plant.states), len(plant.inputs)
     rng = np.random.default_rng(0)
 
     def controller(name: str, cost: float) -> ControllerResult:
@@ -31,14 +27,14 @@ def made_up(task: str) -> TaskResult:
     names = ("MPC_1", "MPC_2", "MPC_3", "reference")
     controllers = [controller(name, cost) for name, cost in zip(names, (4.0, 3.0, 1.5, 2.0), strict=True)]
     behaviour = ControllerResult("behaviour", "", [1.0], [1.0], None)
-    return TaskResult(task, 1.0, 0, env_id, "x/y-v0", "td", 0.9, dt, ["broad"], 0, {}, controllers, behaviour)
+    return TaskResult(task, 1.0, 0, plant.id, "x/y-v0", "td", 0.9, plant.dt, ["broad"], 0, {}, controllers, behaviour)
 
 
-@pytest.mark.parametrize(("task", "panels"), [("linear", 4), ("pendulum", 3), ("cartpole", 3)])
-def test_panels_curves_and_bars(task: str, panels: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", PLANTS)
+def test_panels_curves_and_bars(task: str, tmp_path: Path) -> None:
     figure = main_job_figure(made_up(task))
     left, right = figure.subfigs
-    assert len(left.axes) == panels
+    assert len(left.axes) == len(PLANTS[task].shown) + len(PLANTS[task].inputs)
     assert all("(" in axes.get_ylabel() for axes in left.axes), "every axis names its unit"
     assert left.axes[-1].get_xlabel() == "time (s)"
     (bars,) = right.axes

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from grid_dp import GridOptimum, simulate
 
-from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.envs.episode import EPISODE_STEPS
 from mpcoffline.gallery.collection import starting_states
 from mpcoffline.studies.references import best_known_costs, replay
@@ -49,5 +49,7 @@ def test_it_agrees_with_dynamic_programming() -> None:
 
 
 def test_other_tasks_are_refused() -> None:
-    with pytest.raises(InvalidArgumentError, match="task: expected one of pendulum, cartpole, got 'linear'"):
+    with pytest.raises(InvalidArgumentError, match=r"task: expected a plant with an equation of motion.*got 'linear'"):
         best_known_costs("linear", np.zeros((1, 4)))
+    with pytest.raises(UnknownIdError, match="Did you mean 'pendulum'"):
+        best_known_costs("pendulom", np.zeros((1, 2)))

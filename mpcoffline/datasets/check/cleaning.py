@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from filelock import FileLock, Timeout
-
 from mpcoffline.core.caches import KINDS, disk_size, entries, remove
-from mpcoffline.core.errors import UnknownIdError
+from mpcoffline.core.errors import MPCOfflineError, UnknownIdError
 from mpcoffline.core.places import cache_root, temporary_root
-from mpcoffline.core.scratch import abandoned, remove_abandoned
-from mpcoffline.datasets.store.local import dataset_path
-from mpcoffline.datasets.store.recording_lock import empty_recordings, remove_empty
+from mpcoffline.core.scratch import abandoned, is_free, remove_abandoned
+from mpcoffline.datasets.record.recording import seal
+from mpcoffline.datasets.record.resuming import sealed_recordings
+from mpcoffline.datasets.store.ids import dataset_path
+from mpcoffline.datasets.store.recording_lock import empty_recordings, recording_path, remove_empty
 
 Kind = Literal["leftovers", "caches", "downloads", "backups"]
 
@@ -114,8 +114,12 @@ def clean(kinds: Iterable[Kind] = DEFAULT_KINDS, *, remove_found: bool = False) 
 
 
 def _without(waste: Waste) -> Waste:
-    if waste.kind == "downloads" and not _is_free(waste.path.with_name(waste.path.name + ".lock")):
+    if waste.kind == "downloads" and not is_free(waste.path.with_name(f"{waste.path.name}.lock")):
         return waste  # begun again meanwhile
+    for name in sealed_recordings():
+        if waste.path == recording_path(name):
+            with suppress(MPCOfflineError):  # the data set is damaged: the logs are all there is
+                seal(name)
     if waste.path in empty_recordings():
         remove_empty(waste.path)
     elif waste.kind == "leftovers":
@@ -134,7 +138,7 @@ def _leftovers() -> Iterator[Waste]:
         with suppress(OSError):
             for path in abandoned(place):
                 yield Waste("leftovers", path, disk_size(path))
-    for path in empty_recordings():
+    for path in [*empty_recordings(), *map(recording_path, sealed_recordings())]:
         yield Waste("leftovers", path, disk_size(path))
 
 
@@ -146,19 +150,9 @@ def _caches() -> Iterator[Waste]:
 
 def _downloads() -> Iterator[Waste]:
     root = dataset_path("") / ".downloading"
-    for lock in sorted(root.glob("*.lock")) if root.is_dir() else ():
-        folder = lock.with_suffix("")
-        if folder.is_dir() and _is_free(lock):
+    for folder in sorted(root.iterdir()) if root.is_dir() else ():
+        if folder.is_dir() and is_free(folder.with_name(f"{folder.name}.lock")):
             yield Waste("downloads", folder, disk_size(folder))
-
-
-def _is_free(lock: Path) -> bool:
-    """Whether nobody downloads at this moment."""
-    try:
-        with FileLock(lock, timeout=0.0, thread_local=False):
-            return True
-    except (OSError, Timeout):
-        return False
 
 
 def _backups() -> Iterator[Waste]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import importlib.metadata
 import json
 import os
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,20 +20,17 @@ from mpcoffline.core.atomic import publish
 from mpcoffline.core.errors import FileFormatError, StorageError, UnknownIdError
 from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import METADATA_BYTES
+from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.core.text import visible
 from mpcoffline.datasets.record.recording import seal
 from mpcoffline.datasets.store.hdf5_guard import check_episodes, episode_number
-from mpcoffline.datasets.store.local import (
-    check_dataset_id,
-    dataset_path,
-    finish,
-    is_local,
-    list_datasets,
-    recording_of,
-)
+from mpcoffline.datasets.store.hdf5_writing import SteadyFile, checked, write_steadily
+from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
+from mpcoffline.datasets.store.local import list_datasets
 from mpcoffline.datasets.store.manifest import MANIFEST, differences
 from mpcoffline.datasets.store.opening import DATA_FILE, check_space, open_dataset
-from mpcoffline.datasets.store.recording_lock import RecordingLock, log_files, recording_path
+from mpcoffline.datasets.store.recording_lock import RecordingLock, kept_path, log_files, recording_path
+from mpcoffline.datasets.store.writing import finish, recording_of
 
 _STEPS = ("actions", "rewards", "terminations", "truncations")
 
@@ -47,8 +42,7 @@ class RepairReport:
     Attributes:
         dataset_id: Minari id.
         action: ``"sealed"`` (the data set was made of a recording's logs), ``"salvaged"`` (of what is intact of them),
-            ``"rebuilt"`` (of the readable
-            episodes of its HDF5 file), or ``"intact"`` (nothing was to be done).
+            ``"rebuilt"`` (of the readable episodes of its HDF5 file), or ``"intact"`` (nothing was to be done).
         episodes: Number of episodes that the data set has now.
         steps: Number of transitions that the data set has now.
         notes: What was lost or had to be guessed, one sentence each.
@@ -111,7 +105,7 @@ def repair(dataset_id: str, *, env_spec: EnvSpec | None = None, salvage: bool = 
 
 
 def _repair_stored(dataset_id: str, env_spec: EnvSpec | None) -> RepairReport:
-    path = dataset_path(dataset_id) / "data" / "main_data.hdf5"
+    path = dataset_path(dataset_id) / "data" / DATA_FILE
     metadata = _metadata(dataset_id)
     if metadata.get("data_format", "hdf5") != "hdf5":
         raise FileFormatError(
@@ -148,27 +142,26 @@ def _repair_stored(dataset_id: str, env_spec: EnvSpec | None) -> RepairReport:
 
 def _rebuild(dataset_id: str, file: Any, names: list[str], metadata: dict[str, Any]) -> Path:
     """Puts a data set of these groups of a file in the place of the damaged one; returns where that is kept."""
-    target, building = dataset_path(dataset_id), None
-    try:
-        free, needed = shutil.disk_usage(dataset_path("")).free, int(Path(file.filename).stat().st_size) + (1 << 20)
-        if free < needed:  # HDF5 itself must not meet a full disk: it would end the process
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        building = Path(tempfile.mkdtemp(prefix=".building-", dir=dataset_path("")))
-        data = building / "data"
-        data.mkdir()
-        with h5py.File(data / DATA_FILE, "w", track_order=True) as new:
-            for number, name in enumerate(names):
+
+    def copy(new_file: SteadyFile) -> None:
+        with h5py.File(new_file, "w", track_order=True) as new:
+            for number, name in enumerate(checked(names, new_file)):
                 file.copy(name, new, f"episode_{number}")
                 new[f"episode_{number}"].attrs["id"] = number
-        (data / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
-        finish(building, {})
-        backup = _back_up(dataset_id)
-        publish(building, target, overwrite=True)
-    except (OSError, RuntimeError, shutil.Error) as error:
+
+    target = dataset_path(dataset_id)
+    try:
+        with scratch_folder(dataset_path("")) as building:
+            data = building / "data"
+            data.mkdir()
+            (data / DATA_FILE).touch()
+            write_steadily(data / DATA_FILE, copy)
+            (data / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
+            finish(building, {})
+            backup = _back_up(dataset_id)
+            publish(building, target, overwrite=True)
+    except (OSError, RuntimeError) as error:
         raise StorageError.of(target, error) from error
-    finally:
-        if building is not None:
-            shutil.rmtree(building, ignore_errors=True)
     return backup
 
 
@@ -249,7 +242,7 @@ def _note_changes(dataset_id: str, notes: list[str]) -> None:
         changed = [difference.path for difference in differences(dataset_path(dataset_id))]
     except FileNotFoundError:
         return
-    except FileFormatError as error:
+    except (FileFormatError, OSError) as error:
         notes.append(f"Whether numbers have changed is unknown: {error}")
         return
     if f"data/{DATA_FILE}" in changed:
@@ -335,13 +328,13 @@ def _is_readable(dataset_id: str) -> bool:
 
 def _back_up(dataset_id: str) -> Path:
     """Keeps the folder as it is under another, hidden name: links where they can be, so that it needs no room yet."""
-    source, number = dataset_path(dataset_id), 0
-    start = dataset_path("") / ".broken" / dataset_id
-    start = start.with_name(os.fsdecode(os.fsencode(start.name)[:240]))  # names of files end at 255 bytes
-    while (backup := start.with_name(f"{start.name}-{number}")).exists():
-        number += 1
+    source, backup = dataset_path(dataset_id), kept_path(dataset_id)
     backup.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)
+    try:
+        shutil.copytree(source, backup, copy_function=_link_or_copy, ignore=_special)
+    except OSError:
+        shutil.rmtree(backup, ignore_errors=True)
+        raise
     return backup
 
 

@@ -17,7 +17,7 @@ from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, Unkno
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.tables import Table, verdict
 from mpcoffline.core.text import visible
-from mpcoffline.datasets.store.local import load_dataset
+from mpcoffline.datasets.hub.loading import load_dataset
 
 from .rebuilding import without_window
 from .simulation import QUANTITIES, TOLERANCES, Deviation, Simulation

@@ -2,6 +2,9 @@
 
 Minari's own clients start a file anew after a broken connection, take no revision and check no hash; these read the
 same places (a Hugging Face organisation, a Google Cloud Storage bucket, laid out by Minari) with all three.
+
+``huggingface_hub.snapshot_download`` (2.4) takes a revision, but it throws away what a broken attempt has brought,
+writes as many bytes as a server sends before it compares them with the size, and knows no other remote.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ without it there is none. The layout is Minari's too: what is uploaded here, ``m
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -20,15 +19,19 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from filelock import FileLock, Timeout
+
 from mpcoffline.core.atomic import publish
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError, UnknownIdError
+from mpcoffline.core.outputs import write_file
 from mpcoffline.core.progress import Bars
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.datasets.store.local import _declare_namespace, check_dataset_id, dataset_path, is_local, load_dataset
+from mpcoffline.datasets.store.ids import check_dataset_id, dataset_path, is_local
 from mpcoffline.datasets.store.manifest import MANIFEST, differences, read_manifest, sha256_of, write_manifest
 from mpcoffline.datasets.store.opening import open_dataset
 from mpcoffline.datasets.store.recording_lock import check_not_recorded
 from mpcoffline.datasets.store.verification import verify
+from mpcoffline.datasets.store.writing import declare_namespace
 
 from .remotes import SETTING, Listing, Remote, RemoteError, fetch, open_remote, remote_errors
 
@@ -128,15 +131,10 @@ def download_dataset(
     """
     check_dataset_id(dataset_id)
     if is_local(dataset_id) and not overwrite:
-        return load_dataset(dataset_id)
+        return open_dataset(dataset_path(dataset_id))
     source = find_source(dataset_id, remote, revision)
     if source is None:
-        raise InvalidArgumentError(
-            "remote",
-            expected="one that is configured",
-            actual="none",
-            hint=f"Set {SETTING}=hf://ORGANISATION (or gcp://BUCKET) to where the data set is, or pass remote=.",
-        )
+        raise _no_remote()
     check_not_recorded(dataset_id)
     with _download_folder(dataset_id) as folder:
         staged = folder / "dataset"
@@ -147,13 +145,13 @@ def download_dataset(
             _fetch_all(place, listing, staged, unchecked=unchecked, progress=progress)
         _check(staged, dataset_id, source, unchecked=unchecked)
         try:
-            _declare_namespace(dataset_id)
+            declare_namespace(dataset_id)
             publish(staged, dataset_path(dataset_id), overwrite=overwrite)
         except OSError as error:
             if not is_local(dataset_id) or overwrite:
                 raise StorageError.of(dataset_path(dataset_id), error) from error
         shutil.rmtree(folder, ignore_errors=True)
-    return load_dataset(dataset_id)
+    return open_dataset(dataset_path(dataset_id))
 
 
 def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | None = None) -> UploadReceipt:
@@ -177,9 +175,7 @@ def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | N
         raise InvalidDataError(f"data set {dataset_id!r}", expected="no finding of `verify`", actual=str(report))
     url = remote or os.environ.get(SETTING)
     if not url:
-        raise InvalidArgumentError(
-            "remote", expected="one that is configured", actual="none", hint=f"Set {SETTING}=hf://ORGANISATION."
-        )
+        raise _no_remote()
     place = open_remote(url, token)
     try:
         place.listing(dataset_id, None)
@@ -201,6 +197,11 @@ def upload_dataset(dataset_id: str, *, remote: str | None = None, token: str | N
     if digest != sha256_of(folder / MANIFEST):
         raise RemoteError(f"remote {url}: {MANIFEST}", expected="what was uploaded", actual=f"sha256 {digest}")
     return UploadReceipt(dataset_id, Source(url, listing.revision, digest))
+
+
+def _no_remote() -> InvalidArgumentError:
+    hint = f"Set {SETTING}=hf://ORGANISATION (or gcp://BUCKET) to where data sets are, or pass remote=."
+    return InvalidArgumentError("remote", expected="one that is configured", actual="none", hint=hint)
 
 
 def _upload(url: str, token: str | None, dataset_id: str) -> None:
@@ -280,13 +281,12 @@ def _check(staged: Path, dataset_id: str, source: Source, *, unchecked: bool) ->
                 hint="Run it again to fetch it once more; if that repeats, the remote's copy is damaged.",
             )
     try:
-        found = open_dataset(staged).spec.dataset_id
+        if (found := open_dataset(staged).spec.dataset_id) != dataset_id:
+            name = f"{source.remote}: {dataset_id}"
+            raise FileFormatError(name, expected="a data set of that id", actual=repr(found))
     except FileFormatError:
         shutil.rmtree(staged)
         raise
-    if found != dataset_id:
-        shutil.rmtree(staged)
-        raise FileFormatError(f"{source.remote}: {dataset_id}", expected="a data set of that id", actual=repr(found))
 
 
 @contextmanager
@@ -296,25 +296,23 @@ def _download_folder(dataset_id: str) -> Iterator[Path]:
     label = dataset_id.replace("/", "--")
     if len(os.fsencode(label)) > 200:  # names of files end at 255 bytes
         label = hashlib.sha256(os.fsencode(dataset_id)).hexdigest()
-    folder = root / label
+    folder, lock = root / label, FileLock(root / f"{label}.lock", thread_local=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(root / f"{folder.name}.lock", os.O_RDWR | os.O_CREAT, 0o644)
+        lock.acquire(timeout=0.0)
+    except Timeout as error:
+        raise StorageError(
+            f"data set {dataset_id!r}",
+            expected="one download at a time",
+            actual="another process that downloads it now",
+            hint="Wait for it to finish.",
+        ) from error
     except OSError as error:
         raise StorageError.of(folder, error) from error
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise StorageError(
-                f"data set {dataset_id!r}",
-                expected="one download at a time",
-                actual="another process that downloads it now",
-                hint="Wait for it to finish.",
-            ) from error
         yield folder
     finally:
-        os.close(descriptor)
+        lock.release()
 
 
 def _begin(folder: Path, remote: str, revision: str) -> None:
@@ -322,7 +320,7 @@ def _begin(folder: Path, remote: str, revision: str) -> None:
     label, content = folder / "source.json", json.dumps({"remote": remote, "revision": revision})
     if not label.exists() or label.read_text(encoding="utf-8") != content:
         shutil.rmtree(folder / "dataset", ignore_errors=True)
-        label.write_text(content, encoding="utf-8")
+        write_file(label, content)
 
 
 def _is_complete(folder: Path, source: Source) -> bool:

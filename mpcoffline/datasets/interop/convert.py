@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.datasets.store.local import load_dataset
+from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 if TYPE_CHECKING:

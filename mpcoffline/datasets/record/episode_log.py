@@ -1,6 +1,6 @@
 """An append-only log of episodes that survives a killed process and a lost power supply.
 
-A file is a magic number and records one after the other, see :mod:`.log_records`. First comes the header, JSON; it
+A file is a magic number and records one after the other, see :mod:`.log_format`. First comes the header, JSON; it
 is on the disk before the file has its name, and comes once more behind the first episode, so that no damage at one
 place takes it. Then come episodes; a long one is written in pieces while it is under way, the last of which is marked
 as its end. A file that was closed in order ends with a record that says so.
@@ -23,7 +23,7 @@ from typing import BinaryIO
 
 from mpcoffline.core.errors import FileFormatError, StorageError
 
-from .log_records import (
+from .log_format import (
     CLOSED,
     END,
     EPISODE,
@@ -39,8 +39,8 @@ from .log_records import (
     decode,
     decode_header,
     encode,
+    framed,
     joined,
-    record,
     unframed,
 )
 
@@ -314,7 +314,7 @@ class EpisodeLog:
             self._fd = -1
 
     def _write(self, content: bytes, kind: int) -> None:
-        whole = memoryview(record(kind, content, self._end))
+        whole = memoryview(framed(kind, content, self._end))
         try:
             written = 0
             while written < len(whole):
@@ -333,7 +333,7 @@ def _create(path: Path, header: LogHeader) -> None:
     new = path.with_suffix(".new")
     try:
         with new.open("wb") as file:
-            file.write(MAGIC + record(HEADER, _header_content(header), len(MAGIC)))
+            file.write(MAGIC + framed(HEADER, _header_content(header), len(MAGIC)))
             file.flush()
             os.fsync(file.fileno())
         os.replace(new, path)

@@ -15,10 +15,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.datasets.checks import check_storable
-from mpcoffline.datasets.store.local import check_new_dataset
+from mpcoffline.datasets.store.writing import check_new_dataset
+from mpcoffline.datasets.table.numbers import check_storable
 
-from .episodes import EpisodeBuilder
+from .episode_builder import EpisodeBuilder
 from .plants import common_spec
 from .recording import Recording
 from .stage_cost import PlantInfo

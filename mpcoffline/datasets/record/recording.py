@@ -17,14 +17,15 @@ from gymnasium.envs.registration import EnvSpec
 
 from mpcoffline.core.atomic import sync_folder
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.datasets.checks import check_storable
-from mpcoffline.datasets.store.local import check_new_dataset, dataset_path, is_local, recording_of, write_dataset
+from mpcoffline.datasets.store.ids import dataset_path, is_local
 from mpcoffline.datasets.store.opening import check_space, open_dataset
 from mpcoffline.datasets.store.recording_lock import RecordingLock, log_files, recording_path
+from mpcoffline.datasets.store.writing import check_new_dataset, recording_of, write_dataset
+from mpcoffline.datasets.table.numbers import check_storable
 
 from .episode_log import EpisodeLog, LogIndex, scan
-from .log_records import LoggedEpisode, LogHeader
-from .same_recording import are_continued, check_extends, common_header, origin_json, remove_logs, set_aside
+from .log_format import LoggedEpisode, LogHeader
+from .resuming import are_continued, check_extends, common_header, origin_json, remove_logs, set_aside
 
 if TYPE_CHECKING:
     from minari import MinariDataset

@@ -21,19 +21,19 @@ from mpcoffline.core.limits import EXPANSION, EXPANSION_ALLOWANCE, GROUP_DEPTH, 
 
 _UNDEFINED = 2**64 - 1
 _WORD, _PAIR = struct.Struct("<Q"), struct.Struct("<QQ")
-_SPACE, _TYPE, _EXTERNAL, _LAYOUT, _FILTERS = 0x01, 0x03, 0x07, 0x08, 0x0B
+_SPACE, _LINKS, _TYPE, _EXTERNAL, _LAYOUT, _FILTERS = 0x01, 0x02, 0x03, 0x07, 0x08, 0x0B
 _CONTINUED, _SYMBOL_TABLE = 0x10, 0x11
+_GROUP = {_LINKS, _SYMBOL_TABLE}
+_SINGLE = {_SPACE, _TYPE, _EXTERNAL, _LAYOUT, _FILTERS, *_GROUP}  # of two, HDF5 would take the first
 _VLEN_CLASSES = (6, 9, 10)  # compound, variable length, array: may hold what is stored elsewhere
 _NAME_BYTES = 1024
 _NULL = (0,)  # a null array, like a single number, has no shape
 _ROWS = ("observations", "actions", "rewards", "terminations", "truncations")
 _ONE_LEAF = (b"TREE\0\0\1\0", b"TREE\1\0\1\0")  # a tree of one entry, of a group and of chunks
-
-
-_CONTINUATIONS = 256
+_RECORDS_ALLOWANCE = 2 << 20  # bytes that a few flipped bits may add to lengths before it counts as an attack
 
 _EPISODE = re.compile(r"episode_(0|[1-9][0-9]{0,17})")
-_FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, OverflowError, struct.error)
+_FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, ArithmeticError, struct.error)
 
 _Messages = dict[int, int]
 
@@ -108,6 +108,7 @@ class _Walk:
         self._cuts: dict[str, tuple[int, int]] = {}  # by name: length of the header, where the address stands
         self._bytes_left = EXPANSION_ALLOWANCE + EXPANSION * len(content)
         self._members_left = len(content) // LINK_BYTES
+        self._records_left = len(content) + _RECORDS_ALLOWANCE
 
     def members(self) -> dict[str, tuple[int, FileFormatError | None]]:
         """For each member of the root its rows, as :meth:`_visit` counts them, and what is wrong with it."""
@@ -115,6 +116,8 @@ class _Walk:
         found: dict[str, tuple[int, FileFormatError | None]] = {}
         for name, target in self._members("/", place, self._messages("/", place)):
             try:
+                if name in found:
+                    raise self._refused("/", "each name once", repr(name))
                 found[name] = (self._visit(f"/{name}", target, GROUP_DEPTH), None)
             except _FAULTS as error:
                 found[name] = (-1, _fault(f"{self._name}: /{name}", error))
@@ -141,13 +144,19 @@ class _Walk:
             self._arrays[place] = self._chunked(where, self._word(place + self._cuts[column][1]), *form)
             return self._declare(where, place)
         messages = self._messages(where, place)
-        if _SPACE in messages:
-            self._arrays[place] = self._array(where, place, messages)
-            return self._declare(where, place)
+        if _SPACE in messages and messages.keys().isdisjoint(_GROUP):  # else HDF5 takes it for a group
+            array = self._arrays[place] = self._array(where, place, messages)
+            rows = self._declare(where, place)
+            if array != _NULL and (_TYPE not in messages or self._content[messages[_TYPE]] & 15 in _VLEN_CLASSES):
+                self._check_texts(where)  # only now: reading them takes as long as there are rows
+            return rows
         if depth == 0:
             raise self._refused(where, f"at most {GROUP_DEPTH} groups within each other", "more")
+        members = self._members(where, place, messages)
+        if len(dict(members)) < len(members):
+            raise self._refused(where, "each name once", "one of them again")
         rows = -1
-        for name, target in self._members(where, place, messages):
+        for name, target in members:
             found = self._visit(f"{where}/{name}", target, depth - 1)
             if depth == GROUP_DEPTH and name in _ROWS and found < 0 and target in self._arrays:
                 raise self._refused(f"{where}/{name}", "an array of rows", "one without")
@@ -168,7 +177,7 @@ class _Walk:
     def _members(self, where: str, place: int, messages: _Messages) -> list[tuple[str, int]]:
         """Names and places of a group's members; the place of a link to elsewhere is undefined."""
         self._once(where, place)
-        if _SYMBOL_TABLE in messages:
+        if _SYMBOL_TABLE in messages and _LINKS not in messages:
             tree, heap = _PAIR.unpack_from(self._content, messages[_SYMBOL_TABLE])
             names = self._word(heap + 24)
             leaves = self._leaves(where, tree, kind=0, width=16)
@@ -215,6 +224,7 @@ class _Walk:
                 here, entries = self._content[node + 5], int.from_bytes(self._content[node + 6 : node + 8], "little")
                 if level not in (-1, here + 1):
                     raise self._refused(where, "a tree whose levels go down by one", f"level {here}")
+                self._claim(where, node + 24, entries * width)
                 places = [node + 24 + i * width for i in range(entries)]
                 if here == 0:
                     found += places
@@ -238,8 +248,6 @@ class _Walk:
         rank, begin = content[space + 1], space + (8 if content[space] == 1 else 4)
         shape = struct.unpack_from(f"<{rank}Q", content, begin)
         (itemsize,) = struct.unpack_from("<I", content, kind + 4)
-        if content[kind] & 15 in _VLEN_CLASSES:
-            self._check_texts(where)
         size = math.prod(shape) * itemsize
         if content[layout + 1] == 0 or size == 0:  # compact: within the header
             return (*shape, size)
@@ -250,7 +258,7 @@ class _Walk:
             return self._other_array(where)
         chunk = struct.unpack_from(f"<{rank}I", content, layout + 11)
         form = (shape, chunk, itemsize, _FILTERS in messages)
-        if _CONTINUED not in messages and content[kind] & 15 not in _VLEN_CLASSES:
+        if content[place] == 1 and _CONTINUED not in messages and content[kind] & 15 not in _VLEN_CLASSES:
             size, cut = self._uint(place + 8, 4) + 16, layout + 3 - place
             self._cuts[where[where.rfind("/") :]] = (size, cut)
             self._forms[self._header(place, size, cut)] = form
@@ -285,8 +293,9 @@ class _Walk:
         import h5py
 
         array = self._file[where]
-        if array.id.get_type().get_class() != h5py.h5t.VLEN and array.id.get_type().get_class() != h5py.h5t.STRING:
-            if array.id.get_type().detect_class(h5py.h5t.VLEN):
+        kind = array.id.get_type()
+        if kind.get_class() not in (h5py.h5t.VLEN, h5py.h5t.STRING):
+            if kind.detect_class(h5py.h5t.VLEN):
                 raise self._refused(where, "numbers or texts", str(array.dtype))
             return
         if array.ndim != 1:
@@ -302,18 +311,13 @@ class _Walk:
 
     def _other_array(self, where: str) -> tuple[int, ...]:
         """The same for an array in another of HDF5's forms."""
-        import h5py
-
         array = self._file[where]
         if array.is_virtual or array.external:
             raise self._refused(where, "data in this file", "some in another")
         if array.shape is None:
             return _NULL
-        if array.id.get_type().detect_class(h5py.h5t.VLEN):
-            self._check_texts(where)
         size = array.size * array.id.get_type().get_size()
-        filtered = array.chunks is not None and array.id.get_create_plist().get_nfilters() > 0
-        if filtered:
+        if array.chunks is not None:
             wanted = math.prod(-(-rows // part) for rows, part in zip(array.shape, array.chunks, strict=True))
             missing = wanted - array.id.get_num_chunks()
             size = max(size, wanted * math.prod(array.chunks) * array.id.get_type().get_size())
@@ -329,7 +333,7 @@ class _Walk:
         """Kind to position of an object header's messages; a shared one, whose content is elsewhere, is left out."""
         content = self._content
         blocks = [(place + 16, self._uint(place + 8, 4))]
-        size, checksum = 8, 0
+        size, checksum, seen = 8, 0, set()
         if content[place : place + 4] == b"OHDR":
             flags = content[place + 5]
             start = place + 6 + 16 * (flags >> 5 & 1) + 4 * (flags >> 4 & 1)
@@ -339,10 +343,10 @@ class _Walk:
         elif content[place] != 1:
             raise self._refused(where, "an object", f"something else at byte {place}")
         found: _Messages = {}
-        visited = 0
         while blocks:
             offset, length = blocks.pop()
-            end = min(offset + length, len(content))
+            self._claim(where, offset, length)
+            end = offset + length
             while offset + size <= end:
                 if checksum:
                     kind, length, shared = content[offset], self._uint(offset + 1, 2), content[offset + 3] & 2
@@ -352,13 +356,19 @@ class _Walk:
                 if kind == _CONTINUED:
                     begin, room = _PAIR.unpack_from(content, offset)
                     blocks.append((begin + checksum, room - 2 * checksum))
-                    visited += 1
-                    if visited > _CONTINUATIONS:
-                        raise self._refused(where, f"at most {_CONTINUATIONS} pieces of its header", "more")
+                if kind in _SINGLE and kind in seen:
+                    raise self._refused(where, "each part of its header once", f"one of kind {kind} again")
+                seen.add(kind)
                 if not shared:
                     found[kind] = offset
                 offset += length
         return found
+
+    def _claim(self, where: str, place: int, size: int) -> None:
+        """Counts the bytes of a record: in all no more than the file has, for no two records share any."""
+        if place + size > len(self._content) or size > self._records_left:
+            raise self._refused(where, "records that lie in this file, beside each other", f"{size} bytes at {place}")
+        self._records_left -= max(0, size)
 
     def _once(self, where: str, place: int) -> None:
         if place in self._nodes:

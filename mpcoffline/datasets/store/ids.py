@@ -1,9 +1,12 @@
-"""Which ids a data set may have: those that Minari, the file system and the lists all take for the same thing."""
+"""Which ids a data set may have, those that Minari, the file system and the lists take for the same, and its folder."""
 
 from __future__ import annotations
 
 import os
 import re
+from pathlib import Path
+
+from mpcoffline.core.errors import InvalidArgumentError
 
 GRAMMAR = (
     "(namespace/)*name-vN of letters, digits, '-' and '_' (no dots; a namespace has two characters or more, is not"
@@ -36,3 +39,25 @@ def is_valid_id(dataset_id: object) -> bool:
         return False
     taken = any(part.casefold() == "data" or re.search(rf"{_VERSION.pattern}\Z", part) for part in namespaces)
     return fits and not taken
+
+
+def check_dataset_id(dataset_id: object) -> None:
+    """Refuses an id that Minari could not parse, or would take for something else.
+
+    Raises:
+        InvalidArgumentError: Naming Minari's grammar.
+    """
+    if not is_valid_id(dataset_id):
+        raise InvalidArgumentError("dataset_id", expected=f"an id {GRAMMAR}", actual=repr(dataset_id))
+
+
+def dataset_path(dataset_id: str) -> Path:
+    """The folder of a data set in the local Minari store, whether it exists or not."""
+    from minari.storage import get_dataset_path
+
+    return Path(get_dataset_path(dataset_id))
+
+
+def is_local(dataset_id: str) -> bool:
+    """Whether the local Minari store holds the data set."""
+    return (dataset_path(dataset_id) / "data").exists()

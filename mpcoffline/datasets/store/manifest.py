@@ -7,15 +7,15 @@ Minari stores no hash. The manifest lists every file of the data set's folder bu
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import MANIFEST_BYTES
+from mpcoffline.core.outputs import write_file
 from mpcoffline.core.text import visible
 
 MANIFEST = "SHA256SUMS"
@@ -57,27 +57,24 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_manifest(folder: Path) -> Path:
-    """Writes the manifest of a data set's folder, atomically and synced.
+def write_manifest(folder: Path, names: Iterable[str] | None = None) -> Path:
+    """Writes the manifest of a folder, atomically and synced.
 
     Args:
         folder: The folder that holds ``data``.
+        names: The files that it lists, by path within; by default all that are not hidden.
 
     Returns:
         The manifest's path.
+
+    Raises:
+        StorageError: Where the disk refuses.
     """
+    lines = [f"{sha256_of(folder / name)}  {name}\n" for name in (_files(folder) if names is None else names)]
     target = folder / MANIFEST
-    partial = folder / f".{MANIFEST}.{os.getpid()}"
-    lines = [f"{sha256_of(folder / name)}  {name}\n" for name in _files(folder)]
-    try:
-        with partial.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(lines)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
-    return target
+    if target.is_symlink():  # it may be somebody else's, and lead anywhere: it is replaced, not what it leads to
+        target.unlink()
+    return write_file(target, "".join(lines))
 
 
 def read_manifest(folder: Path) -> dict[str, str]:

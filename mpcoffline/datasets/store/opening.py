@@ -14,11 +14,13 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from mpcoffline.core.caches import read_note, write_note
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import (
@@ -32,7 +34,7 @@ from mpcoffline.core.limits import (
 from mpcoffline.core.places import cache_folder
 
 from .hdf5_guard import check_episodes, check_hdf5
-from .ids import is_valid_id
+from .ids import dataset_path, is_valid_id
 from .manifest import MANIFEST, differences
 
 if TYPE_CHECKING:
@@ -297,23 +299,16 @@ def _paths(folder: str) -> Iterator[str]:
         yield from (entry.path for entry in entries)
 
 
-def _record(folder: Path) -> Path:
-    name = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:32]
-    return cache_folder("checked") / f"{name}.json"
-
-
 def _is_known(folder: Path, state: str) -> bool:
     if not state:
         return False
     if _found_here.get(folder) == state:
         return True
-    try:
-        known = bool(json.loads(read_limited(_record(folder), 1000)) == {"version": _RECORD_VERSION, "state": state})
-    except (OSError, ValueError, RuntimeError):
-        return False
-    if known:
-        _found_here[folder] = state
-    return known
+    with suppress(OSError):
+        if read_note(cache_folder("checked"), folder) == {"version": _RECORD_VERSION, "state": state}:
+            _found_here[folder] = state
+            return True
+    return False
 
 
 def _remember(folder: Path, state: str) -> None:
@@ -321,22 +316,14 @@ def _remember(folder: Path, state: str) -> None:
     if not state:
         return
     _found_here[folder] = state
-    try:
-        record = _record(folder)
-        record.parent.mkdir(parents=True, exist_ok=True)
-        new = record.with_suffix(f".{os.getpid()}")
-        new.write_text(json.dumps({"version": _RECORD_VERSION, "state": state}), encoding="utf-8")
-        os.replace(new, record)
-    except (OSError, RuntimeError):
-        return
+    with suppress(OSError, RuntimeError):
+        write_note(cache_folder("checked"), folder, {"version": _RECORD_VERSION, "state": state})
 
 
 def _id_of(folder: Path) -> str:
     """The id of a folder in the local store; its path for any other."""
-    from minari.storage import get_dataset_path
-
     try:
-        return folder.relative_to(get_dataset_path("")).as_posix()
+        return folder.relative_to(dataset_path("")).as_posix()
     except ValueError:
         return str(folder)
 

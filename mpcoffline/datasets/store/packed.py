@@ -10,7 +10,6 @@ machine's sine into a visibly different episode.
 from __future__ import annotations
 
 import itertools
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,12 +21,13 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
-from mpcoffline.core.errors import FileFormatError, InvalidDataError, StorageError
+from mpcoffline.core.errors import FileFormatError, InvalidDataError
+from mpcoffline.core.outputs import replaced
 from mpcoffline.envs import ControlTask
 
 from .hdf5_guard import check_hdf5
-from .local import write_dataset
-from .writing import SteadyFile, write_steadily
+from .hdf5_writing import SteadyFile, write_steadily
+from .writing import episode_of, write_dataset
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -79,15 +79,8 @@ def pack(dataset: MinariDataset, path: str | Path) -> None:
             file.create_dataset("lengths", data=np.array([len(a) for a in actions], dtype=np.int32))
             file.create_dataset("terminated", data=np.array(terminated))
 
-    new = Path(path).with_name(f".{Path(path).name}.{os.getpid()}")
-    try:
-        new.touch()
-        write_steadily(new, write)
-        new.replace(path)
-    except OSError as error:
-        raise StorageError.of(path, error) from error
-    finally:
-        new.unlink(missing_ok=True)
+    with replaced(path) as new:
+        write_steadily(Path(new.name), write)
 
 
 def packed_size(path: str | Path) -> tuple[int, int]:
@@ -152,21 +145,8 @@ def unpack(path: str | Path, dataset_id: str, *, overwrite: bool = False) -> Min
 def _episode(
     task: ControlTask, states: NDArray[np.float64], actions: NDArray[np.float32], terminated: bool
 ) -> EpisodeBuffer:
-    from minari.data_collector import EpisodeBuffer
-
     costs = task.cost(states[:-1], actions.astype(np.float64))
-    terminations = np.zeros(len(actions), dtype=bool)
-    truncations = np.zeros(len(actions), dtype=bool)
-    terminations[-1], truncations[-1] = terminated, not terminated
-    columns: dict[str, Any] = {
-        "observations": task.observe(states),
-        "actions": actions,
-        "rewards": -costs,
-        "terminations": terminations,
-        "truncations": truncations,
-        "infos": {"cost": np.concatenate([[0.0], costs])[:, None], "state": states},
-    }
-    return EpisodeBuffer(**columns)
+    return episode_of(task.observe(states), actions, costs, states, terminated=terminated)
 
 
 def _recorded_states(where: str, episode: Any) -> NDArray[np.float64]:

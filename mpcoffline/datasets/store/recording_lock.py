@@ -16,21 +16,26 @@ from pathlib import Path
 
 from mpcoffline.core.errors import InvalidArgumentError, StorageError
 
-
-def _store() -> Path:
-    from minari.storage import get_dataset_path
-
-    return Path(get_dataset_path(""))
+from .ids import dataset_path
 
 
 def recording_path(dataset_id: str) -> Path:
     """The folder of a data set's logs, whether it exists or not."""
-    return _store() / ".recording" / dataset_id
+    return dataset_path("") / ".recording" / dataset_id
 
 
 def log_files(dataset_id: str) -> list[Path]:
     """The logs of a data set that have not been sealed."""
     return sorted(recording_path(dataset_id).glob("env-*.log"))
+
+
+def kept_path(dataset_id: str, kind: str = "") -> Path:
+    """A hidden folder that does not exist yet, for what is kept of a data set or of its logs."""
+    start = dataset_path(f".broken/{dataset_id}")
+    begin, number = os.fsdecode(os.fsencode(start.name)[:230]), 0  # names of files end at 255 bytes
+    while (kept := start.with_name(f"{begin}{kind}-{number}")).exists():
+        number += 1
+    return kept
 
 
 def check_not_recorded(dataset_id: str) -> None:
@@ -131,7 +136,7 @@ class RecordingLock:
             for path in (*self.folder.glob("env-*.new"), self._path):  # a log that was not begun
                 path.unlink(missing_ok=True)
             folder = self.folder
-            while folder != _store():
+            while folder != dataset_path(""):
                 try:
                     folder.rmdir()
                 except OSError:
@@ -168,7 +173,7 @@ def empty_recordings() -> list[Path]:
         below = [] if any(path.parent == folder for path in files) else sorted(folder.iterdir())
         return [found for part in below if part.is_dir() for found in outermost(part)]
 
-    root = _store() / ".recording"
+    root = dataset_path("") / ".recording"
     return outermost(root) if root.is_dir() else []
 
 
@@ -177,7 +182,7 @@ def remove_empty(folder: Path) -> None:
     held = {path.parent for name in ("lock", "env-*.new") for path in folder.rglob(name)}
     for path in sorted(held):
         with contextlib.suppress(InvalidArgumentError, StorageError):
-            RecordingLock(path.relative_to(_store() / ".recording").as_posix()).release()
+            RecordingLock(path.relative_to(dataset_path("") / ".recording").as_posix()).release()
     for path in sorted([folder, *folder.rglob("*")], reverse=True):
         with contextlib.suppress(OSError):
             path.rmdir()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Set
+from collections.abc import Iterator, Set
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,8 @@ from mpcoffline.core.tables import Table, verdict
 from mpcoffline.core.text import visible
 
 from .hdf5_guard import episode_number
-from .local import check_dataset_id, dataset_path, is_local, load_dataset
+from .ids import check_dataset_id, dataset_path, is_local
+from .local import open_local
 from .manifest import MANIFEST, differences, write_manifest
 from .opening import DATA_FILE, faults_of, open_to_examine
 
@@ -141,7 +143,7 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
         if isinstance(dataset, str) and is_local(dataset_id):
             dataset, faults = open_to_examine(folder)
         else:
-            dataset = load_dataset(dataset_id, download=False) if isinstance(dataset, str) else dataset
+            dataset = open_local(dataset_id) if isinstance(dataset, str) else dataset
             faults = faults_of(folder)
         report = _report(dataset, dataset_id, folder, faults)
     except (FileFormatError, OSError) as error:
@@ -163,7 +165,7 @@ def verify(dataset: MinariDataset | str, *, accept: bool = False) -> VerifyRepor
 def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[str, str]) -> VerifyReport:
     findings = [Finding("structure", fault, episode_number(name)) for name, fault in faults.items()]
     faulty = {number for number in map(episode_number, faults) if number is not None}
-    findings += _looked_at("structure", None, lambda: _structure_findings(dataset, dataset_id, faulty))
+    findings += _looked_at("structure", None, _structure_findings(dataset, dataset_id, faulty))
     hashed, changed = _hash_findings(folder)
     findings += changed
     steps = 0
@@ -171,20 +173,18 @@ def _report(dataset: MinariDataset, dataset_id: str, folder: Path, faults: dict[
         if isinstance(episode, Exception):
             findings.append(Finding("structure", f"unreadable: {type(episode).__name__}: {episode}", number))
             continue
-        try:
+        with suppress(TypeError):  # the alignment says so
             steps += len(episode.rewards)
-        except TypeError:  # the alignment says so
-            steps = -1
-        findings += _looked_at("alignment", number, lambda episode=episode: _episode_findings(dataset, episode))  # type: ignore[misc]
-    findings += _looked_at("structure", None, lambda: _count_findings(dataset, steps))
-    return VerifyReport(dataset_id, dataset.total_episodes, max(steps, 0), hashed, tuple(findings))
+        findings += _looked_at("alignment", number, _episode_findings(dataset, episode))
+    findings += _looked_at("structure", None, _count_findings(dataset, steps))
+    return VerifyReport(dataset_id, dataset.total_episodes, steps, hashed, tuple(findings))
 
 
-def _looked_at(check: str, episode: int | None, find: Callable[[], Iterable[Finding]]) -> list[Finding]:
+def _looked_at(check: str, episode: int | None, findings: Iterator[Finding]) -> list[Finding]:
     """What a check finds; what it stumbles over is a finding too: no file's content is an exception here."""
     found: list[Finding] = []
     try:
-        found.extend(find())
+        found.extend(findings)
     except Exception as error:  # references, texts, compounds, other ranks: what a check was not made for
         found.append(Finding(check, f"not what can be checked: {type(error).__name__}: {error}", episode))
     return found
@@ -334,8 +334,8 @@ def _cost(rewards: NDArray[Any], costs: NDArray[Any], episode: int) -> Iterator[
     if costs.size != len(costs):
         yield Finding("cost", f"infos/cost: expected shape ({len(costs)}, 1), got {costs.shape}", episode)
         return
-    wanted = -costs.reshape(-1)[1:].astype(np.float64)
-    error = np.abs(rewards.reshape(-1) - wanted)
+    rewards, wanted = rewards.reshape(-1), -costs.reshape(-1)[1:].astype(np.float64)
+    error = np.abs(rewards - wanted)
     bad = np.isfinite(error) & (error > ROUNDING * np.maximum(1.0, np.abs(wanted)))
     if bad.any():
         step = int(np.flatnonzero(bad)[0])

@@ -1,256 +1,212 @@
-"""Writing HDF5 files so that a full disk, a quota or Ctrl-C is an exception here and never one inside HDF5.
-
-HDF5 does not survive an error of the system while it closes a file: it frees twice what it could not write, and the
-process dies with all that it holds. So HDF5 never meets the disk: a data set is made in memory and then written, in
-one piece; or, where it is large, through a :class:`SteadyFile`, which takes everything: what the system refuses is
-kept in memory for the moment that it takes to stop, and the error is raised afterwards.
-"""
+"""Writing data sets into the Minari store of this machine: complete or not at all."""
 
 from __future__ import annotations
 
-import io
+import contextlib
+import errno
+import importlib.metadata
 import itertools
-import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+import json
+import shutil
+from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
+
+from mpcoffline.core.atomic import publish, sync_tree
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, StorageError
+from mpcoffline.core.outputs import write_file
+from mpcoffline.core.scratch import scratch_folder
+
+from .hdf5_writing import store_episodes
+from .ids import check_dataset_id, dataset_path, is_local
+from .manifest import write_manifest
+from .opening import open_dataset, read_metadata
+from .recording_lock import check_not_recorded
 
 if TYPE_CHECKING:
+    from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
 
-WINDOW = 4 << 20
-IN_MEMORY = 128 << 20  # bytes of episodes
-
-T = TypeVar("T")
+RECORDING = "mpcoffline_recording"
 
 
-class SteadyFile(io.RawIOBase):
-    """A file that can be written and read back whatever the disk says; :meth:`check` tells what it said.
-
-    Its last bytes wait in memory: most of what HDF5 writes, it writes in small pieces near the end.
-
-    Args:
-        path: An existing file.
+def check_new_dataset(dataset_id: str, *, overwrite: bool) -> None:
+    """Refuses an id that is malformed, or that exists unless ``overwrite``.
 
     Raises:
-        OSError: Where it cannot be opened.
+        InvalidArgumentError: For either.
     """
+    check_dataset_id(dataset_id)
+    if is_local(dataset_id) and not overwrite:
+        raise InvalidArgumentError(
+            "dataset_id",
+            expected="the id of a new data set",
+            actual=f"{dataset_id!r}, which exists in {dataset_path(dataset_id)}",
+            hint="Choose another version number, or pass overwrite=True.",
+        )
 
-    def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-        self._position = 0
-        self._base = os.fstat(self._fd).st_size  # what lies behind it is in `_tail`
-        self._tail = bytearray()
-        self._refused: list[tuple[int, bytes]] = []  # pieces before `_base`
-        self._error: BaseException | None = None
 
-    def check(self) -> None:
-        """Raises what the system refused, or what :meth:`stop` was told."""
-        if self._error is not None:
-            raise self._error
+def recording_of(dataset_id: str) -> str | None:
+    """The name of the recording that a local data set was sealed from; None where it has none or does not exist."""
+    try:
+        name = read_metadata(dataset_path(dataset_id)).get(RECORDING)
+    except (OSError, FileFormatError):
+        return None
+    return name if isinstance(name, str) else None
 
-    def stop(self, reason: BaseException) -> None:
-        """Lets the writer's next :meth:`check` fail."""
-        self._error = self._error or reason
 
-    def readable(self) -> bool:
-        """True."""
-        return True
+def episode_of(
+    observations: NDArray[Any], actions: NDArray[Any], costs: NDArray[Any], states: NDArray[Any], *, terminated: bool
+) -> EpisodeBuffer:
+    """An episode as Minari stores it, with costs and states among its infos.
 
-    def writable(self) -> bool:
-        """True."""
-        return True
+    Args:
+        observations: ``(T+1, ny)``.
+        actions: ``(T, nu)``.
+        costs: L(s, a), ``(T,)``; the rewards are -L.
+        states: ``(T+1, nx)``.
+        terminated: Whether it ended in a terminal state; otherwise it was cut off there.
+    """
+    from minari.data_collector import EpisodeBuffer
 
-    def seekable(self) -> bool:
-        """True."""
-        return True
+    last = np.arange(len(actions)) == len(actions) - 1
+    columns: dict[str, Any] = {
+        "observations": observations,
+        "actions": actions,
+        "rewards": -costs,
+        "terminations": last & terminated,
+        "truncations": last & (not terminated),
+        "infos": {"cost": np.concatenate([[0.0], costs])[:, None], "state": states},
+    }
+    return EpisodeBuffer(**columns)
 
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """As every file's."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._base + len(self._tail)}[whence]
-        self._position = start + offset
-        return self._position
 
-    def tell(self) -> int:
-        """As every file's."""
-        return self._position
+def write_dataset(
+    dataset_id: str,
+    episodes: Iterable[EpisodeBuffer],
+    *,
+    env_spec: EnvSpec | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    algorithm_name: str | None = None,
+    description: str | None = None,
+    overwrite: bool = False,
+    extend: bool = False,
+    recording: str | None = None,
+    building: Path | None = None,
+) -> MinariDataset:
+    """Stores episodes as a Minari data set, which appears complete or not at all.
 
-    def write(self, data: Any, /) -> int:
-        """As every file's, but that it never fails."""
-        size, begin = len(data), self._position - self._base
-        if begin < 0:
-            content = bytes(data)
-            self._put(content[:-begin], self._position)
-            self._tail[: max(0, begin + size)] = content[-begin:]
+    ``minari.create_dataset_from_buffers`` writes in place, so that a full disk or a killed process leaves
+    half a data set under the final name. This does the same with the same storage class, but in a hidden
+    folder that is written to the disk, its metadata last, and renamed when complete.
+
+    Args:
+        dataset_id: Minari id.
+        episodes: The episodes, taken one at a time.
+        env_spec: Spec of the environment; None where it has none (it cannot be recovered then).
+        observation_space: Space of the observations.
+        action_space: Space of the actions.
+        algorithm_name: Metadata: what produced the data.
+        description: Metadata: what the data are.
+        overwrite: Whether an existing data set is replaced.
+        extend: Whether the new data set begins with the episodes of the one replaced, and keeps its metadata.
+        recording: Name of the recording that the episodes come from, kept in the metadata.
+        building: The folder to build in, which must not exist; by default a hidden one in the store.
+
+    Returns:
+        The stored data set.
+
+    Raises:
+        InvalidArgumentError: For a malformed id, one that exists or is being recorded, or no episode at all.
+        StorageError: Where the disk is full or fails; nothing is left behind.
+    """
+    from minari.dataset.minari_storage import MinariStorage
+
+    check_new_dataset(dataset_id, overwrite=overwrite)
+    if recording is None:
+        check_not_recorded(dataset_id)
+    iterator = iter(episodes)
+    first = next(iterator, None)
+    if first is None:
+        raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
+    target = dataset_path(dataset_id)
+    new_folders = [folder for folder in target.parents if not folder.exists()]
+    metadata = {RECORDING: recording}
+    scratch = ExitStack()
+    try:
+        if building is None:
+            # Hidden from Minari's listing; in the store, so that the rename stays in one file system.
+            building = scratch.enter_context(scratch_folder(dataset_path("")))
+        building.mkdir(exist_ok=True)
+        data = building / "data"
+        if extend:
+            open_dataset(target)  # what is damaged must not be sealed anew
+            shutil.copytree(target / "data", data)
+            storage = open_dataset(building, sums=False).storage
         else:
-            if begin > len(self._tail):
-                self._tail.extend(bytes(begin - len(self._tail)))
-            self._tail[begin : begin + size] = data
-            if len(self._tail) > WINDOW:
-                self._write_out(len(self._tail) - WINDOW // 4)
-        self._position += size
-        return size
-
-    def readinto(self, buffer: Any, /) -> int:
-        """As every file's."""
-        view = memoryview(buffer).cast("B")
-        end = min(self._position + len(view), self._base + len(self._tail))
-        stored = max(0, min(end, self._base) - self._position)
-        # Shorter only where a piece was refused: it comes next.
-        os.preadv(self._fd, [view[:stored]], self._position)
-        for offset, piece in self._refused:
-            first, last = max(offset, self._position), min(offset + len(piece), self._position + stored)
-            if first < last:
-                view[first - self._position : last - self._position] = piece[first - offset : last - offset]
-        begin = self._position + stored - self._base
-        size = max(0, end - self._position)
-        view[stored:size] = self._tail[begin : begin + size - stored]
-        self._position += size
-        return size
-
-    def truncate(self, size: int | None = None, /) -> int:
-        """As every file's, but that it never fails."""
-        size = self._position if size is None else size
-        self.flush()
-        if self._error is None and self._try(lambda: os.ftruncate(self._fd, size)):
-            self._base = size
-        self._tail.extend(bytes(max(0, size - self._base - len(self._tail))))
-        return size
-
-    def flush(self) -> None:
-        """Hands all that waits in memory to the system."""
-        self._write_out(len(self._tail))
-
-    def close(self) -> None:
-        """Closes the file; harmless when repeated."""
-        if not self.closed:
-            super().close()
-            os.close(self._fd)
-
-    def _write_out(self, size: int) -> None:
-        if self._error is None and size:
-            piece = bytes(self._tail[:size])
-            if self._try(lambda: _pwrite(self._fd, piece, self._base)):
-                self._tail = self._tail[size:]
-                self._base += size
-
-    def _put(self, piece: bytes, offset: int) -> None:
-        if self._error is not None or not self._try(lambda: _pwrite(self._fd, piece, offset)):
-            self._refused.append((offset, piece))
-
-    def _try(self, call: Callable[[], None]) -> bool:
-        try:
-            call()
-        except OSError as error:
-            self.stop(error)
-        return self._error is None
-
-
-def _pwrite(descriptor: int, data: bytes, offset: int) -> None:
-    written = 0
-    while written < len(data):
-        written += os.pwrite(descriptor, memoryview(data)[written:], offset + written)
-
-
-def write_steadily(path: Path, job: Callable[[SteadyFile], None]) -> None:
-    """Has HDF5 write a file.
-
-    The job runs in a thread of its own: signals, and with them the exceptions of their handlers (Ctrl-C), come to the
-    main thread alone, and so never out of a function that HDF5 calls.
-
-    Args:
-        path: An existing file.
-        job: Writes into what it is given, by h5py; it calls ``check`` every now and then.
-
-    Raises:
-        OSError: What the system refused, after the job has ended.
-    """
-    file = SteadyFile(path)
-
-    def work() -> None:
-        with file:
-            job(file)
-        file.check()
-
-    with ThreadPoolExecutor(1) as pool:
-        done = pool.submit(work)
-        try:
-            done.result()
-        except BaseException as error:
-            file.stop(error)
+            storage = MinariStorage.new(
+                data, observation_space=observation_space, action_space=action_space, env_spec=env_spec
+            )
+            metadata |= {
+                "dataset_id": dataset_id,
+                "minari_version": importlib.metadata.version("minari"),
+                "algorithm_name": algorithm_name,
+                "description": description,
+            }
+        store_episodes(storage, itertools.chain([first], iterator), new=not extend)
+        finish(building, {key: value for key, value in metadata.items() if value is not None})
+        declare_namespace(dataset_id)
+        publish(building, target, overwrite=overwrite)
+    except (OSError, RuntimeError) as error:
+        _undeclare_namespace(target, new_folders)
+        if isinstance(error, MPCOfflineError) or (isinstance(error, OSError) and error.errno == errno.ENOTEMPTY):
             raise
+        # h5py reports a full disk as either, and once more when it closes the file.
+        raise StorageError.of(target, error) from error
+    finally:
+        if building is not None:
+            shutil.rmtree(building, ignore_errors=True)
+        scratch.close()
+    return open_dataset(target, sums=False)
 
 
-def checked(items: Iterable[T], file: SteadyFile) -> Iterator[T]:
-    """The items one by one, as long as the file takes what is made of them."""
-    for item in items:
-        file.check()
-        yield item
+def finish(building: Path, metadata: dict[str, str]) -> None:
+    """Completes a data set's folder: data on the disk, then its metadata, then the manifest of both."""
+    sync_tree(building)
+    path = building / "data" / "metadata.json"
+    write_file(path, json.dumps(json.loads(path.read_text(encoding="utf-8")) | metadata))
+    write_manifest(building)
+    building.chmod(0o755)
 
 
-def store_episodes(storage: Any, episodes: Iterable[EpisodeBuffer], *, new: bool) -> None:
-    """Minari's ``update_episodes``, with which no full disk and no signal ends the process.
+def declare_namespace(dataset_id: str) -> None:
+    """Creates Minari's record of the namespace, which its remotes ask for."""
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.namespace import create_namespace, list_local_namespaces
 
-    What is small enough is made in memory, which costs nothing; the rest goes through a :class:`SteadyFile`.
-
-    Args:
-        storage: Minari's HDF5 storage; not to be used afterwards.
-        episodes: The episodes, taken one at a time (in another thread where they are many).
-        new: Whether the storage is empty.
-
-    Raises:
-        OSError: What the system refused.
-    """
-    path = Path(storage._file_path)
-    held: deque[EpisodeBuffer] = deque()
-    rest = iter(episodes)
-    room = IN_MEMORY if new else IN_MEMORY - path.stat().st_size
-    for episode in rest:
-        held.append(episode)
-        room -= _size(vars(episode))
-        if room < 0:
-            break
-    consumed = itertools.chain((held.popleft() for _ in range(len(held))), rest)
-    if room >= 0:
-        _store_in_memory(storage, path, consumed, mode="w" if new else "r+")
-    else:
-        _store_steadily(storage, path, consumed, new=new)
+    namespace, _, _ = parse_dataset_id(dataset_id)
+    if namespace is not None and namespace not in list_local_namespaces():
+        try:
+            create_namespace(namespace)
+        except ValueError:
+            # Another process declared it in the meantime; anything else is an error.
+            if namespace not in list_local_namespaces():
+                raise
 
 
-def _store_in_memory(storage: Any, path: Path, episodes: Iterable[EpisodeBuffer], *, mode: str) -> None:
-    import h5py
-
-    with h5py.File(path, mode, driver="core", backing_store=False, track_order=True) as file:
-
-        def written_at_last() -> Iterator[EpisodeBuffer]:
-            yield from episodes
-            file.flush()  # and now to the disk, before Minari asks for its size
-            path.write_bytes(file.id.get_file_image())
-
-        storage._file_path = file.id  # which Minari gives to h5py.File
-        storage.update_episodes(written_at_last())
-
-
-def _store_steadily(storage: Any, path: Path, episodes: Iterable[EpisodeBuffer], *, new: bool) -> None:
-    import h5py
-
-    def job(file: SteadyFile) -> None:
-        if new:
-            h5py.File(file, "w", track_order=True).close()
-        storage._file_path = file  # which Minari gives to h5py.File
-        storage.update_episodes(checked(episodes, file))
-
-    write_steadily(path, job)
-
-
-def _size(item: Any) -> int:
-    """Bytes of the arrays of an episode, whatever they are nested in."""
-    if isinstance(item, dict):
-        return sum(map(_size, item.values()))
-    if isinstance(item, tuple | list):
-        return sum(map(_size, item))
-    return np.asarray(item).nbytes if item is not None else 0
+def _undeclare_namespace(target: Path, new_folders: list[Path]) -> None:
+    """Removes the records that :func:`declare_namespace` could not write, and the folders made for them."""
+    for folder in target.relative_to(dataset_path("")).parents:
+        record = dataset_path("") / folder / "namespace_metadata.json"
+        if record.exists() and (record.parent in new_folders or record.stat().st_size == 0):
+            record.unlink(missing_ok=True)
+        if record.parent in new_folders:
+            with contextlib.suppress(OSError):  # another process's data set has come into it
+                record.parent.rmdir()

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidDataError
-from mpcoffline.datasets.checks import check_finite, checked_episode_ids, floats
 
 from .build import BuiltRows
 from .centring import Digits, Floats
 from .math import CHUNK
+from .numbers import check_finite, checked_episode_ids, floats
 
 
 def read_arrays(

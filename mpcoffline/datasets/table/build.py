@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidDataError, StorageError
-from mpcoffline.datasets.checks import check_finite
 from mpcoffline.datasets.store.opening import DATA_FILE, check_stored
 
 from .cache import TableFile, cached_table, content_key, scratch_table, table_folder
 from .centring import Centring, Digits
 from .hdf5_episodes import EpisodeColumns, read_episodes
+from .math import CHUNK
+from .numbers import check_finite
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -37,6 +38,23 @@ class BuiltRows(NamedTuple):
     ny: int
     nu: int
     centring: Centring
+
+
+def joined(
+    tables: Iterable[tuple[NDArray[np.float32], NDArray[np.int64], Centring]], centring: Centring
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
+    """The rows of several tables, packed anew, block by block; episodes are numbered from 0, each table's apart.
+
+    Args:
+        tables: Of each its packed rows ``(n, 2 ny + nu + 2)``, their episodes ``(n,)``, and what it was packed without.
+        centring: What the result is packed without.
+    """
+    offset = 0
+    for rows, ids, old in tables:
+        episodes, numbers = np.unique(ids, return_inverse=True)
+        for part in (slice(i, i + CHUNK) for i in range(0, len(rows), CHUNK)):
+            yield centring.repacked(rows[part], old), numbers[part] + offset
+        offset += len(episodes)
 
 
 def read_minari(dataset: MinariDataset, name: str, memory: int, cache: Path | None) -> BuiltRows | TableFile:

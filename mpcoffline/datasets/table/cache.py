@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.atomic import publish
-from mpcoffline.core.caches import mark_used, trim
+from mpcoffline.core.caches import mark_used, read_note, trim, write_note
 from mpcoffline.core.errors import FileFormatError, StorageError
-from mpcoffline.core.files import read_limited
 from mpcoffline.core.limits import TABLE_META_BYTES, check_limit
 from mpcoffline.core.places import cache_folder, open_own, private_folder
 from mpcoffline.core.scratch import scratch_folder
@@ -249,18 +248,15 @@ def cached_table(
     except FileFormatError:
         shutil.rmtree(target, ignore_errors=True)
     with _scratch_folder(cache) as building:
+        write_table(building, ny, nu, blocks)
+        if (better := again()) is not None:
+            write_table(building, ny, nu, *better)
         try:
-            write_table(building, ny, nu, blocks)
-            if (better := again()) is not None:
-                write_table(building, ny, nu, *better)
-            try:
-                publish(building, target, overwrite=False)
-            except OSError:
-                if not target.exists():  # otherwise another process was faster: its table is as good
-                    raise
-            file = TableFile(target)
-        except OSError as error:
-            raise error if isinstance(error, StorageError) else StorageError.of(target, error) from error
+            publish(building, target, overwrite=False)
+        except OSError:
+            if not target.exists():  # otherwise another process was faster: its table is as good
+                raise
+        file = TableFile(target)
     trim(keep=target)
     return file
 
@@ -297,21 +293,12 @@ def content_key(path: Path, episodes: NDArray[Any] | None, cache: Path) -> str:
     """
     stat = path.stat()
     signature = [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
-    note = cache / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:32]}.json"
-    try:
-        known = json.loads(read_limited(note, 1000))
-        digest = str(known["sha256"]) if known["signature"] == signature else None
-    except (OSError, ValueError, KeyError, TypeError):
-        digest = None
-    if digest is None:
-        digest = sha256_of(path)
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            new = note.with_suffix(f".{os.getpid()}")
-            new.write_text(json.dumps({"signature": signature, "sha256": digest}), encoding="utf-8")
-            os.replace(new, note)
-        except OSError as error:
-            raise StorageError.of(cache, error) from error
+    match read_note(cache, path):
+        case {"signature": known, "sha256": str(digest)} if known == signature:
+            pass
+        case _:
+            digest = sha256_of(path)
+            write_note(cache, path, {"signature": signature, "sha256": digest})
     chosen = b"" if episodes is None else np.ascontiguousarray(episodes, np.int64).tobytes()
     return hashlib.sha256(digest.encode() + chosen).hexdigest()[:40]
 

@@ -31,6 +31,24 @@ class Columns(NamedTuple):
     terminations: Any
 
 
+class Episodes(NamedTuple):
+    """Where the episodes of a table lie, ordered by their ids.
+
+    Attributes:
+        ids: Ids, ``(E,)``.
+        firsts: First row of each, ``(E,)``.
+        lengths: Number of rows of each, ``(E,)``.
+    """
+
+    ids: NDArray[np.int64]
+    firsts: NDArray[np.intp]
+    lengths: NDArray[np.intp]
+
+    def rows(self, number: int) -> slice:
+        """The rows of the episode of that place among the ids; a negative one counts from the end."""
+        return slice(int(self.firsts[number]), int(self.firsts[number] + self.lengths[number]))
+
+
 class TableStatistics(NamedTuple):
     """Moments and ranges of a table's columns, float64: vectors for observations and actions, else numbers.
 
@@ -128,31 +146,46 @@ def innermost(
         block = rows[i : i + CHUNK]
         s, s_next = split(block, ny, nu)[::3] if states is None else states(block)
         # float64: ratios of float32 numbers can overflow.
-        reached = np.maximum(np.abs(s), np.abs(s_next)).astype(np.float64)
-        score[i : i + CHUNK] = (reached / scale).max(axis=1)
+        reached = np.maximum(np.abs(s.T), np.abs(s_next.T)).astype(np.float64, order="C")
+        score[i : i + CHUNK] = (reached / scale[:, None]).max(axis=0)
     kept = max(1, round(fraction * len(rows)))
-    # Stable, so that ties are broken by order and the result does not depend on the machine.
-    return np.sort(np.argsort(score, kind="stable")[:kept])
+    farthest = np.partition(score, kept - 1)[kept - 1]
+    inside = score < farthest
+    inside[np.flatnonzero(score == farthest)[: kept - inside.sum()]] = True  # ties by order: the same on each machine
+    return np.flatnonzero(inside)
 
 
 def magnitudes(rows: NDArray[np.float32], ny: int) -> Floats:
-    """The exact median of |s| of each observation ``(ny,)``; where that is 0 its mean, where that is 0 too, 1.
-
-    A non-negative float32 has the order of its bits read as an integer. So one pass counts the upper halves of these,
-    and a second one the lower halves where the upper one is the median's: two passes, whatever n is.
-    """
+    """The exact median of |s| of each observation ``(ny,)``; where that is 0 its mean, where that is 0 too, 1."""
     n = len(rows)
     ranks = sorted({(n - 1) // 2, n // 2})
+    middle = _ranked_in_file if isinstance(rows, np.memmap) else _ranked
+    scale = middle(rows, ny, ranks).mean(axis=0, dtype=np.float64)
+    if not scale.all():
+        total = sum(np.abs(rows[i : i + CHUNK, :ny]).sum(axis=0, dtype=np.float64) for i in range(0, n, CHUNK))
+        scale = np.where(scale > 0.0, scale, total / n)
+    return np.where(scale > 0.0, scale, 1.0)
+
+
+def _ranked(rows: NDArray[np.float32], ny: int, ranks: list[int]) -> NDArray[np.float32]:
+    """The entries of those ranks among the |s| of each observation, ``(ranks, ny)``."""
+    return np.stack([np.partition(np.abs(rows[:, i]), ranks)[ranks] for i in range(ny)], axis=1)
+
+
+def _ranked_in_file(rows: NDArray[np.float32], ny: int, ranks: list[int]) -> NDArray[np.float32]:
+    """The same of a memory map, in two passes and little memory, whatever n is.
+
+    A non-negative float32 has the order of its bits read as an integer. So one pass counts the upper halves of these,
+    and a second one the lower halves where the upper one is that of the rank.
+    """
     upper = np.zeros((ny, 1 << 16), dtype=np.int64)
-    total = np.zeros(ny)
-    for high, _, size in _halves(rows, ny):
-        total += size.sum(axis=0, dtype=np.float64)
+    for high, _ in _halves(rows, ny):
         for i in range(ny):
             upper[i] += np.bincount(high[:, i], minlength=1 << 16)
     ends = np.cumsum(upper, axis=1)
     bins = np.array([[np.searchsorted(ends[i], rank, side="right") for i in range(ny)] for rank in ranks])
     lower = np.zeros((len(ranks), ny, 1 << 16), dtype=np.int64)
-    for high, low, _ in _halves(rows, ny):
+    for high, low in _halves(rows, ny):
         for k in range(len(ranks)):
             for i in range(ny):
                 lower[k, i] += np.bincount(low[high[:, i] == bins[k, i], i], minlength=1 << 16)
@@ -161,14 +194,11 @@ def magnitudes(rows: NDArray[np.float32], ny: int) -> Floats:
         for i in range(ny):
             before = ends[i, bins[k, i]] - upper[i, bins[k, i]]
             found[k, i] = (bins[k, i] << 16) + np.searchsorted(np.cumsum(lower[k, i]), rank - before, side="right")
-    scale = found.view(np.float32).mean(axis=0, dtype=np.float64)
-    scale = np.where(scale > 0.0, scale, total / n)
-    return np.where(scale > 0.0, scale, 1.0)
+    return found.view(np.float32)
 
 
-def _halves(rows: NDArray[np.float32], ny: int) -> Iterator[tuple[NDArray[Any], NDArray[Any], NDArray[np.float32]]]:
-    """Upper and lower halves of the bits of |s|, and |s|, block by block."""
+def _halves(rows: NDArray[np.float32], ny: int) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Upper and lower halves of the bits of |s|, block by block."""
     for i in range(0, len(rows), CHUNK):
-        size = np.abs(rows[i : i + CHUNK, :ny])
-        bits = size.view(np.uint32)
-        yield bits >> 16, bits & 0xFFFF, size
+        bits = np.abs(rows[i : i + CHUNK, :ny]).view(np.uint32)
+        yield bits >> 16, bits & 0xFFFF

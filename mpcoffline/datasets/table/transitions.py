@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpcoffline.core.checks import check_integers
-from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
-from mpcoffline.datasets.checks import check_bounds, check_sizes
+from mpcoffline.core.checks import check_integers, check_number
+from mpcoffline.core.errors import InvalidArgumentError
 
 from .arrays import read_arrays
-from .build import BuiltRows, read_minari
+from .build import BuiltRows, joined, read_minari
 from .cache import TableFile, default_memory, scratch_table
 from .centring import Centring
-from .math import CHUNK, Columns, TableStatistics, innermost, moments, split
+from .math import CHUNK, Columns, Episodes, TableStatistics, innermost, moments, split
+from .numbers import check_bounds, check_sizes
 from .sampler import block_batches, gather_batches
 
-__all__ = ["Columns", "TableStatistics", "TransitionTable"]
+__all__ = ["Columns", "Episodes", "TableStatistics", "TransitionTable"]
 
 if TYPE_CHECKING:
     import torch
@@ -119,7 +119,12 @@ class TransitionTable:
     @property
     def n_episodes(self) -> int:
         """Number of episodes."""
-        return len(np.unique(self.episode_ids))
+        return len(self.episodes.ids)
+
+    @property
+    def episodes(self) -> Episodes:
+        """Where its episodes lie: ids, first rows and lengths, ``(E,)`` each."""
+        return Episodes(*np.unique(self.episode_ids, return_index=True, return_counts=True))
 
     def columns(self, block: Any) -> Columns:
         """The five columns of a block of rows (a minibatch, or all rows) in units.
@@ -136,10 +141,23 @@ class TransitionTable:
         return split(self.centring.values(self.rows), self.ny, self.nu)
 
     def take(self, rows: NDArray[np.intp] | slice) -> TransitionTable:
-        """A table in memory of some of the rows, in the order given."""
+        """A table in memory of some of the rows, in the order given: ``table.take(table.episodes.rows(-1))``."""
         return TransitionTable(
             self.rows[rows], self.ny, self.nu, self.episode_ids[rows], self.name, centring=self.centring
         )
+
+    def sample(self, count: int, rng: np.random.Generator | int) -> TransitionTable:
+        """A table in memory of rows drawn at random, each at most once, in the order that they have here.
+
+        Args:
+            count: How many; all of them where there are no more.
+            rng: Random generator or seed.
+
+        Raises:
+            InvalidArgumentError: For a count below 1.
+        """
+        check_integers(1, count=count)
+        return self.take(np.sort(np.random.default_rng(rng).permutation(len(self))[:count]))
 
     def with_states(self, observations: ArrayLike, next_observations: ArrayLike) -> TransitionTable:
         """A table in memory with other s and s+, ``(n, ny)`` each, packed as this one is."""
@@ -182,7 +200,7 @@ class TransitionTable:
                 or terminations that are not boolean.
         """
         columns = observations, actions, costs, next_observations, terminations
-        return cls._built(read_arrays(name, *columns, episode_ids), name)
+        return cls._of(read_arrays(name, *columns, episode_ids), name)
 
     @classmethod
     def of(cls, data: TransitionTable | MinariDataset | str) -> TransitionTable:
@@ -222,15 +240,12 @@ class TransitionTable:
             StorageError: Where a table larger than ``memory`` cannot be written.
         """
         if isinstance(dataset, str):
-            from mpcoffline.datasets.store.local import load_dataset
+            from mpcoffline.datasets.hub.loading import load_dataset
 
             dataset = load_dataset(dataset)
         name = f"data set {dataset.spec.dataset_id!r}"
         memory = default_memory() if memory is None else memory
-        built = read_minari(dataset, name, memory, None if cache is None else Path(cache))
-        if isinstance(built, TableFile):
-            return cls._of_file(built, name, memory)
-        return cls._built(built, name)
+        return cls._of(read_minari(dataset, name, memory, None if cache is None else Path(cache)), name, memory)
 
     @classmethod
     def concat(cls, tables: Sequence[TransitionTable], *, name: str | None = None) -> TransitionTable:
@@ -247,24 +262,12 @@ class TransitionTable:
         if not tables:
             raise InvalidArgumentError("tables", expected="at least one", actual="none")
         first = tables[0]
-        for table in tables:
-            if (table.ny, table.nu) != (first.ny, first.nu):
-                raise InvalidDataError(
-                    table.name,
-                    expected=f"{first.ny} observations and {first.nu} actions, as in {first.name}",
-                    actual=f"{table.ny} and {table.nu}",
-                )
+        for other in tables:
+            check_sizes(other.name, {"observations": (other.ny, first.ny), "actions": (other.nu, first.nu)}, first.name)
         centring = Centring.common([table.centring for table in tables], [len(table) for table in tables])
-        blocks, offset = [], 0
-        for table in tables:
-            episodes, numbers = np.unique(table.episode_ids, return_inverse=True)
-            blocks += [
-                (centring.repacked(table.rows[i : i + CHUNK], table.centring), numbers[i : i + CHUNK] + offset)
-                for i in range(0, len(table), CHUNK)
-            ]
-            offset += len(episodes)
-        label = name or " + ".join(table.name for table in tables)
-        return next((table for table in tables if table.is_mapped), first).rewritten(blocks, label, centring)
+        blocks = joined(((table.rows, table.episode_ids, table.centring) for table in tables), centring)
+        largest = next((table for table in tables if table.is_mapped), first)
+        return largest.rewritten(blocks, name or " + ".join(table.name for table in tables), centring)
 
     def rewritten(
         self,
@@ -287,7 +290,7 @@ class TransitionTable:
             rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
             return TransitionTable(rows, self.ny, self.nu, ids, name or self.name, centring=centring)
         file = scratch_table(self.ny, self.nu, blocks, self._file.folder.parent, centring)
-        return self._of_file(file, name or self.name, self._memory)
+        return self._of(file, name or self.name, self._memory)
 
     def check_fits(
         self, ny: int, nu: int, action_low: ArrayLike | None = None, action_high: ArrayLike | None = None
@@ -322,8 +325,7 @@ class TransitionTable:
         Raises:
             InvalidArgumentError: For another fraction.
         """
-        if not 0.0 < fraction <= 1.0:
-            raise InvalidArgumentError("fraction", expected="a number in (0, 1]", actual=str(fraction))
+        check_number("fraction", fraction, 0.0, 1.0)
         return self._take(innermost(self.rows, self.ny, self.nu, fraction, self.centring.states))
 
     def statistics(self) -> TableStatistics:
@@ -346,7 +348,7 @@ class TransitionTable:
         """
         if not 0.0 < fraction < 1.0:
             raise InvalidArgumentError("fraction", expected="a number in (0, 1)", actual=str(fraction))
-        episodes = np.unique(self.episode_ids)
+        episodes = self.episodes.ids
         if len(episodes) < 2:
             raise InvalidArgumentError(f"{self.name}: episodes", expected="two or more to split", actual="1")
         count = min(max(1, round(fraction * len(episodes))), len(episodes) - 1)
@@ -389,11 +391,7 @@ class TransitionTable:
         return self.rewritten((self.rows[part], self.episode_ids[part]) for part in parts)
 
     @classmethod
-    def _built(cls, built: BuiltRows, name: str) -> TransitionTable:
-        return cls(built.rows, built.ny, built.nu, built.episode_ids, name, centring=built.centring)
-
-    @classmethod
-    def _of_file(cls, file: TableFile, name: str, memory: int | None) -> TransitionTable:
-        return cls(
-            file.raw_rows, file.ny, file.nu, file.raw_ids, name, centring=file.centring, file=file, memory=memory
-        )
+    def _of(cls, built: BuiltRows | TableFile, name: str, memory: int | None = None) -> TransitionTable:
+        file = built if isinstance(built, TableFile) else None
+        rows, ids = (built.raw_rows, built.raw_ids) if isinstance(built, TableFile) else (built.rows, built.episode_ids)
+        return cls(rows, built.ny, built.nu, ids, name, centring=built.centring, file=file, memory=memory)

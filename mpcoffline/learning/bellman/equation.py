@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.datasets.table.transitions import Columns
-from mpcoffline.estimation.identification import FULL_TURN, Steps, without_jumps
+from mpcoffline.estimation.identification import FULL_TURN, Transitions, without_jumps
 from mpcoffline.learning.value.fit import ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
@@ -23,7 +23,7 @@ def variance_of(costs: NDArray[np.floating[Any]]) -> float:
     return float(costs.var(dtype=np.float64)) or 1.0
 
 
-class BellmanFit:
+class BellmanProblem:
     """The regression error of (FIT), arXiv:2301.01667.
 
     ::
@@ -94,12 +94,12 @@ class PredictionError:
         theta: Parameters with which the model predicts well enough to see jumps of a full turn.
     """
 
-    def __init__(self, problem: BellmanFit, sample: Columns, theta: Tensor) -> None:
+    def __init__(self, problem: BellmanProblem, sample: Columns, theta: Tensor) -> None:
         self._problem = problem
         s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
         with torch.no_grad():
             missed = reached - problem.predicted(sample, theta)
-        rows, self._angles = without_jumps(Steps(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
+        rows, self._angles = without_jumps(Transitions(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
         spread = (torch.from_numpy(rows.reached) - s).std(dim=0, correction=0)
         self._scale = torch.where(spread > 0.0, spread, 1.0)
 

@@ -16,7 +16,7 @@ from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 
-from .equation import BellmanFit
+from .equation import BellmanProblem
 from .potential import Potential
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ class Refit(NamedTuple):
 def refit_cost(
     mpc: MPC,
     theta: Array,
-    problem: BellmanFit,
+    problem: BellmanProblem,
     sample: Columns,
     *,
     prior: float,
@@ -111,7 +111,7 @@ def refit_cost(
     return Refit(fitted, float(error), potential)
 
 
-def _shaping(potential: Potential | None, problem: BellmanFit, sample: Columns, theta: Array) -> Tensor:
+def _shaping(potential: Potential | None, problem: BellmanProblem, sample: Columns, theta: Array) -> Tensor:
     """The columns m_j(s) - gamma m_j(f(s,a)) that the potential's coefficients multiply, ``(n, size)``."""
     if potential is None:
         return torch.zeros(len(sample.costs), 0, dtype=torch.float64)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,14 +12,14 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.progress import Metrics, Report, silent
+from mpcoffline.learning.progress import Metrics, OnEpoch, silent
+from mpcoffline.learning.stages import FitResult
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 
-from .equation import BellmanFit, PredictionError, variance_of
-from .potential import Potential
+from .equation import BellmanProblem, PredictionError, variance_of
 from .refit import refit_cost
 
 Array = NDArray[np.float64]
@@ -32,7 +30,7 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # Adam's state; it does not count 
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class ParameterConfig:
     """How theta is learned.
 
     Attributes:
@@ -72,41 +70,6 @@ class FitConfig:
         check_integers(1, **{n: getattr(self, n) for n in ("batch_size", "refit_rows", "refit_iterations")})
 
 
-@dataclass(frozen=True)
-class FitResult:
-    """What (FIT) found.
-
-    Attributes:
-        theta: The learned parameters, ``(size,)``.
-        loss_before: The regression error of (FIT) where it began, in units of the cost's variance.
-        loss_after: The same at theta.
-        at_bounds: Names of the learned parameters that ended on a bound.
-        potential: The potential that was fitted with the cost, if one was.
-    """
-
-    theta: Array
-    loss_before: float
-    loss_after: float
-    at_bounds: tuple[str, ...] = ()
-    potential: Potential | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """A JSON-able description, without theta."""
-        return {
-            "loss_before": self.loss_before,
-            "loss_after": self.loss_after,
-            "at_bounds": list(self.at_bounds),
-            "potential": None if self.potential is None else self.potential.to_json(),
-        }
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any], theta: Array) -> FitResult:
-        """The inverse of :meth:`to_json`."""
-        potential = None if data["potential"] is None else Potential.from_json(data["potential"])
-        at_bounds = tuple(map(str, data["at_bounds"]))
-        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential)
-
-
 class ParameterTraining:
     """The state of (FIT) between its steps: Adam on cost and model together, then the convex fit of the cost.
 
@@ -132,7 +95,7 @@ class ParameterTraining:
         value: ValueFunction,
         table: TransitionTable,
         groups: tuple[str, ...],
-        config: FitConfig,
+        config: ParameterConfig,
         *,
         seed: int,
     ) -> None:
@@ -141,9 +104,8 @@ class ParameterTraining:
         if len(costs) > 1 and np.ptp(costs) == 0.0:
             _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
         self._rng = np.random.default_rng(seed)
-        self._problem = BellmanFit(mpc, value, variance_of(costs))
-        rows = np.sort(self._rng.permutation(len(table))[: config.refit_rows])
-        self._sample = table.columns(torch.from_numpy(table.rows[rows]))
+        self._problem = BellmanProblem(mpc, value, variance_of(costs))
+        self._sample = table.columns(torch.from_numpy(table.sample(config.refit_rows, self._rng).rows))
         self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))
         self._coordinates = Coordinates(mpc, groups)
         with torch.no_grad():
@@ -292,11 +254,11 @@ def fit_parameters(
     value: ValueFunction,
     table: TransitionTable,
     groups: tuple[str, ...],
-    config: FitConfig,
+    config: ParameterConfig,
     *,
     seed: int,
     epoch: int = 100,
-    report: Report = silent,
+    report: OnEpoch = silent,
 ) -> FitResult:
     """Learns theta by (FIT): a :class:`ParameterTraining` from beginning to end.
 

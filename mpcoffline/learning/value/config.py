@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from mpcoffline.core.checks import check_integers, check_known, check_number
-from mpcoffline.core.errors import InvalidArgumentError
 
-from .methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
-
-# The loss of each name, given the expectile tau.
-_LOSSES: dict[str, Callable[[float], ValueMethod]] = {
-    "residual": lambda tau: Residual(),
-    "td": lambda tau: TemporalDifference(),
-    "expectile": Expectile,
-    "iql": ImplicitQ,
-}
-VALUE_METHODS = (*_LOSSES, "auto")
+from .methods import VALUE_METHODS, ValueMethod, check_tau, method_from_json
 
 
 @dataclass(frozen=True)
@@ -26,10 +17,10 @@ class ValueConfig:
     """How V_phi is learned.
 
     Attributes:
-        method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, ``"iql"`` for noisy plants, or
-            ``"auto"``: ``"iql"`` where the data are noisy
-            (:func:`~mpcoffline.learning.estimate_stochasticity`), else ``"expectile"``.
-        tau: The expectile, for ``"expectile"`` and ``"iql"``.
+        method: ``"residual"`` (the paper's (VALUE)), ``"td"``, ``"expectile"``, ``"iql"`` for noisy plants, another
+            name in ``VALUE_METHODS``, or ``"auto"``: ``"iql"`` where the data are noisy
+            (:func:`~mpcoffline.learning.estimate_stochasticity`), else ``"expectile"``; or a method itself.
+        tau: The expectile of methods that are named and have one, as ``"expectile"`` and ``"iql"``.
         n_steps: Gradient steps.
         batch_size: Transitions a step.
         learning_rate: Adam's at the start; falls to zero on a cosine.
@@ -41,7 +32,7 @@ class ValueConfig:
         patience: Steps without a smaller validation loss after which learning stops; 0 for never.
     """
 
-    method: str = "residual"
+    method: str | ValueMethod = "residual"
     tau: float = 0.3
     n_steps: int = 8_000
     batch_size: int = 256
@@ -53,9 +44,11 @@ class ValueConfig:
     patience: int = 2_000
 
     def __post_init__(self) -> None:
-        check_known("value method", self.method, VALUE_METHODS)
-        if not 0.0 < self.tau < 1.0:
-            raise InvalidArgumentError("tau", expected="a number in (0, 1)", actual=str(self.tau))
+        if isinstance(self.method, Mapping):  # as a file has it
+            object.__setattr__(self, "method", method_from_json(self.method))
+        if not isinstance(self.method, ValueMethod):
+            check_known("value method", self.method, ("auto", *VALUE_METHODS))
+        check_tau(self.tau)
         check_integers(1, n_steps=self.n_steps, batch_size=self.batch_size, n_members=self.n_members)
         check_integers(1, **{f"hidden[{i}]": width for i, width in enumerate(self.hidden)})
         check_integers(0, patience=self.patience)
@@ -69,8 +62,11 @@ class ValueConfig:
         Args:
             noisy: What ``"auto"`` goes by.
         """
-        name = ("iql" if noisy else "expectile") if self.method == "auto" else self.method
-        return _LOSSES[name](self.tau)
+        if isinstance(self.method, ValueMethod):
+            return self.method
+        kind: Any = VALUE_METHODS[("iql" if noisy else "expectile") if self.method == "auto" else self.method]
+        method: ValueMethod = kind(tau=self.tau) if hasattr(kind, "tau") else kind()
+        return method
 
 
 def cosine(step: int, n_steps: int) -> float:

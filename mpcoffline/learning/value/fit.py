@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.progress import Report, silent
+from mpcoffline.learning.progress import OnEpoch, silent
 
-from .config import VALUE_METHODS, ValueConfig, cosine
+from .config import ValueConfig, cosine
 from .function import ValueFunction
-from .methods import Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
+from .methods import VALUE_METHODS, Expectile, ImplicitQ, Residual, TemporalDifference, ValueMethod
 from .noise import Stochasticity, estimate_stochasticity
 from .training import ValueTraining
 
@@ -36,7 +36,7 @@ def fit_value(
     seed: int,
     device: str = "cpu",
     epoch: int = 500,
-    report: Report = silent,
+    report: OnEpoch = silent,
 ) -> ValueFunction:
     """Learns V_phi by stochastic gradient descent on one of the losses: a :class:`ValueTraining` from start to end.
 

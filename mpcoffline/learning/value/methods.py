@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from numbers import Real
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.registry import Registry
 from mpcoffline.datasets.table.transitions import Columns
 
 
@@ -23,7 +27,11 @@ class Critic(Protocol):
 
 
 class ValueMethod(ABC):
-    """A loss whose minimum is a value function."""
+    """A loss whose minimum is a value function.
+
+    An own one is a frozen dataclass, whose fields are its options; one called ``tau`` is that of the configuration.
+    Registered in :data:`VALUE_METHODS`, it is known by its name, and files can hold it.
+    """
 
     #: Whether a function Q(s, a) is learned beside V.
     learns_q: bool = False
@@ -40,6 +48,11 @@ class ValueMethod(ABC):
         """
 
 
+#: Methods by name; ``"auto"`` chooses among them.
+VALUE_METHODS: Registry[type[ValueMethod]] = Registry("value method", ValueMethod)
+
+
+@VALUE_METHODS.register("residual")
 @dataclass(frozen=True)
 class Residual(ValueMethod):
     """(VALUE) as published: the squared Bellman residual, differentiated on both sides.
@@ -58,6 +71,7 @@ class Residual(ValueMethod):
         return residual.square().mean()
 
 
+@VALUE_METHODS.register("td")
 @dataclass(frozen=True)
 class TemporalDifference(ValueMethod):
     """Semi-gradient TD(0) with a target network: the target is held constant.
@@ -79,6 +93,7 @@ class TemporalDifference(ValueMethod):
         return sampled_target(V_target, batch, discount) - V(batch.observations)
 
 
+@VALUE_METHODS.register("expectile")
 @dataclass(frozen=True)
 class Expectile(ValueMethod):
     """A low expectile of the sampled target: towards the best action in the data instead of the average one.
@@ -96,11 +111,15 @@ class Expectile(ValueMethod):
 
     tau: float = 0.3
 
+    def __post_init__(self) -> None:
+        check_tau(self.tau)
+
     def loss(self, V: Critic, V_target: Critic, batch: Columns, discount: float) -> Tensor:
         """See :class:`ValueMethod`."""
         return expectile_loss(TemporalDifference.errors(V, V_target, batch, discount), self.tau)
 
 
+@VALUE_METHODS.register("iql")
 @dataclass(frozen=True)
 class ImplicitQ(ValueMethod):
     """Implicit Q-learning (Kostrikov et al., arXiv:2110.06169, eqs. 5 and 6) with the sign of costs.
@@ -120,6 +139,9 @@ class ImplicitQ(ValueMethod):
     tau: float = 0.3
     learns_q = True
 
+    def __post_init__(self) -> None:
+        check_tau(self.tau)
+
     def loss(self, V: Critic, V_target: Critic, batch: Columns, discount: float) -> Tensor:
         """See :class:`ValueMethod`; the sum of both."""
         pair = batch.observations, batch.actions
@@ -127,6 +149,44 @@ class ImplicitQ(ValueMethod):
             q_target = V_target.q(*pair)
         low: Tensor = expectile_loss(q_target - V(batch.observations), self.tau)
         return low + (sampled_target(V, batch, discount) - V.q(*pair)).square().mean()
+
+
+def method_to_json(method: ValueMethod) -> dict[str, Any]:
+    """A method as a file has it: its name and its fields.
+
+    Raises:
+        InvalidArgumentError: For a method whose class is not registered or no dataclass: no file can hold it.
+    """
+    name = VALUE_METHODS.name_of(type(method))
+    if not name or not is_dataclass(type(method)):
+        raise InvalidArgumentError(
+            "value method",
+            expected="a registered dataclass, which a file can hold",
+            actual=repr(method)[:200],
+            hint="Register its class: VALUE_METHODS.register of mpcoffline.learning.",
+        )
+    own: Any = method
+    return {"kind": name} | asdict(own)
+
+
+def method_from_json(data: Mapping[str, Any]) -> ValueMethod:
+    """The inverse of :func:`method_to_json`.
+
+    Raises:
+        FileFormatError: For a method that nobody has registered.
+    """
+    options = dict(data)
+    return VALUE_METHODS.of_file(options.pop("kind", None), "value method")(**options)
+
+
+def check_tau(tau: object) -> None:
+    """Refuses anything but a number in (0, 1).
+
+    Raises:
+        InvalidArgumentError: For something else.
+    """
+    if isinstance(tau, bool) or not isinstance(tau, Real) or not 0.0 < float(tau) < 1.0:
+        raise InvalidArgumentError("tau", expected="a number in (0, 1)", actual=repr(tau)[:80])
 
 
 def sampled_target(V: Critic, batch: Columns, discount: float) -> Tensor:

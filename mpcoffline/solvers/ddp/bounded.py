@@ -16,7 +16,7 @@ _BOUNDED = 'ulimit -t "$1" 2>/dev/null; ulimit -v "$2" 2>/dev/null; shift 2; exe
 def run_bounded(
     command: Sequence[str], *, timeout: float, source: str | None = None, env: Mapping[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Runs a program to its end; what it started ends with it.
+    """Runs a program to its end; where it is cut short, what it started ends with it.
 
     Args:
         command: The program and its arguments.

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Array, Plan, Solution, Solver
+from mpcoffline.solvers.interface import SOLVERS, Array, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
 from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
+from mpcoffline.solvers.status import Stats, Status
 
 from .build import compiled
 from .codegen import source
 
-_STATUS = ("converged", "iteration limit", "stalled", "not finite")
+_STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE)  # by the kernel's codes
 _LANES = 8
 
 
@@ -60,6 +61,7 @@ class _Batch(ctypes.Structure):
     )
 
 
+@SOLVERS.register("ddp")
 class DDPSolver(Solver):
     """Control-limited differential dynamic programming with Gauss-Newton Hessians, eight problems an instruction.
 
@@ -92,7 +94,8 @@ class DDPSolver(Solver):
         CompilerError: If there is no working C compiler.
     """
 
-    name = "ddp"
+    relative_speed = 500.0
+    needs_compiler = True
     theta_dimensions = (1, 2)
 
     def __init__(
@@ -107,13 +110,6 @@ class DDPSolver(Solver):
         super().__init__(
             mpc, max_iterations=max_iterations, tolerance=tolerance, n_starts=n_starts, n_threads=n_threads
         )
-        if mpc.constraints is not None:
-            raise InvalidArgumentError(
-                "constraints",
-                expected="none but input bounds for the ddp solver",
-                actual="constraints",
-                hint="Use ipopt.",
-            )
         check_options({"max_iterations": max_iterations, "tolerance": tolerance, "n_threads": n_threads})
         if n_starts is None:
             n_starts = 1 if is_convex(mpc) else 16
@@ -134,15 +130,23 @@ class DDPSolver(Solver):
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
 
+    @classmethod
+    def refuses(cls, mpc: MPC) -> str:
+        """See :meth:`Solver.refuses`."""
+        return "" if mpc.constraints is None else "constraints other than input bounds"
+
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
         result = self._run(x, theta, u0, None) if warm_start is None else self._run_warm(x, theta, u0, warm_start)
         status = result["status"]
-        stats: dict[str, Any] = {"iterations": result["iterations"], "time": time.perf_counter() - start}
-        stats["predicted_decrease"] = result["predicted"]
-        stats["all_starts"] = result.get("all_starts", warm_start is None)
-        words = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
-        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], status == 0, words, stats)
+        stats: Stats = {
+            "iterations": result["iterations"],
+            "time": time.perf_counter() - start,
+            "predicted_decrease": result["predicted"],
+            "all_starts": result.get("all_starts", warm_start is None),
+        }
+        ended = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
+        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], status == 0, ended, stats)
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""

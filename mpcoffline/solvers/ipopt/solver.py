@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Array, OneAtATime, Plan, Solution, Solver
+from mpcoffline.solvers.interface import SOLVERS, Array, OneAtATime, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
-from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
+from mpcoffline.solvers.starts import N_CANDIDATES
+from mpcoffline.solvers.status import Stats
 
-from .transcription import Multipliers, Transcription
+from .program import Programs
 from .workers import WorkerPool
 
-_FEASIBILITY_TOLERANCE = 1e-6  # of the size of the states
-_OPTIMALITY_TOLERANCE = 1e-5  # of the size of the terms of the gradient
 
-
+@SOLVERS.register("ipopt")
 class IpoptSolver(Solver):
     """Direct multiple shooting with CasADi and ipopt.
 
@@ -34,7 +30,7 @@ class IpoptSolver(Solver):
 
     What is returned is the model run with the inputs found, within their bounds, and what that costs. ``success`` says
     that this trajectory violates no constraint and that the first-order conditions hold at it
-    (``stats["residual"]``), whatever ipopt returned. Otherwise ``status`` says what is wrong, e.g.
+    (``stats["residual"]``), whatever ipopt returned. Otherwise ``words`` say what is wrong, e.g.
     ``"Infeasible_Problem_Detected: 'speed limit' at stage 3 is violated by 0.2"``.
 
     Args:
@@ -48,7 +44,6 @@ class IpoptSolver(Solver):
             which takes seconds, and end with the solver; results do not depend on their number.
     """
 
-    name = "ipopt"
     theta_dimensions = (1, 2, 3)
 
     def __init__(
@@ -62,7 +57,12 @@ class IpoptSolver(Solver):
         n_workers: int = 1,
     ) -> None:
         super().__init__(
-            mpc, n_starts=n_starts, tolerance=tolerance, max_iterations=max_iterations, n_workers=n_workers
+            mpc,
+            n_starts=n_starts,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            max_time=max_time,
+            n_workers=n_workers,
         )
         if n_starts is not None and not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
@@ -74,28 +74,17 @@ class IpoptSolver(Solver):
                 "n_workers": n_workers,
             }
         )
-        self._n_starts = n_starts or (1 if is_convex(mpc) else 4)
-        self._options: dict[str, Any] = {
-            "n_starts": self._n_starts,
+        program: dict[str, Any] = {
+            "n_starts": n_starts or (1 if is_convex(mpc) else 4),
             "tolerance": tolerance,
             "max_iterations": max_iterations,
             "max_time": max_time,
         }
-        self._candidates = candidate_inputs(mpc)
+        self._programs = Programs(mpc, program)
         self._alone = OneAtATime()
-        self._pool = WorkerPool(mpc, self._options, n_workers) if n_workers > 1 else None
+        self._pool = WorkerPool(mpc, program, n_workers) if n_workers > 1 else None
         if self._pool is None:
-            _ = self._common  # built here, not at the first solve
-
-    @cached_property
-    def _common(self) -> _Program:
-        """The program of one theta for all stages."""
-        return _Program(self.mpc, self._candidates, **self._options)
-
-    @cached_property
-    def _stagewise(self) -> _Program:
-        """The program of one theta a stage."""
-        return _Program(self.mpc, self._candidates, **self._options, stagewise=True)
+            _ = self._programs.common  # built here, not at the first solve
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
@@ -104,184 +93,26 @@ class IpoptSolver(Solver):
             if self._pool is not None and len(x) > 1:
                 found = self._pool.solve(x, theta, u0, warm_start)
             else:
-                found = self.solve_each(x, theta, u0, warm_start)
+                found = self._programs.solve(x, theta, u0, warm_start)
         u = np.stack([one.u for one in found])
-        stats: dict[str, Any] = {
+        stats: Stats = {
             "iterations": np.array([one.iterations for one in found]),
             "time": time.perf_counter() - start,
             "residual": np.array([one.residual for one in found]),
             "violation": np.array([one.violation for one in found]),
             "all_starts": True,
+            "words": [one.words for one in found],
         }
         success, values = np.array([one.success for one in found]), np.array([one.value for one in found])
         trajectories = np.stack([one.x for one in found])
         return Solution(u[:, 0].copy(), trajectories, u, values, success, [one.status for one in found], stats)
 
-    def solve_each(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
-        """Solves the problems one after the other in this process; arguments as checked by ``solve``."""
-        program = self._stagewise if theta.ndim == 3 else self._common
-        known = warm_start.known
-        return [
-            program.solve(
-                state,
-                theta if theta.ndim == 1 else theta[i],
-                None if u0 is None else u0[i],
-                (warm_start.x[i], warm_start.u[i]) if known[i] else None,
-            )
-            for i, state in enumerate(x)
-        ]
-
     def violation(self, x: Array, u: Array) -> Array:
         """See :meth:`Solver.violation`."""
-        return np.array([self._common.excess(*one, self._theta) for one in zip(x, u, strict=True)])
+        return np.array([self._programs.common.excess(*one, self._theta) for one in zip(x, u, strict=True)])
 
     def close(self) -> None:
         """Ends the worker processes, if there are any; a later batch starts them again."""
         if self._pool is not None:
             with self._alone:
                 self._pool.close()
-
-
-@dataclass(frozen=True)
-class Found:
-    """One problem's solution.
-
-    Attributes:
-        x: ``(N + 1, nx)``.
-        u: ``(N, nu)``.
-        value: The objective.
-        success: Whether the trajectory passed all tests.
-        status: ipopt's word, and what is wrong.
-        iterations: Of ipopt, all starts together.
-        residual: Of the first-order conditions, relative.
-        violation: Of the constraint that is violated most; 0 where all hold.
-    """
-
-    x: Array
-    u: Array
-    value: float
-    success: bool
-    status: str
-    iterations: int
-    residual: float
-    violation: float
-
-
-class _Program:
-    """The compiled program: one for the Gauss-Newton, one for the exact Hessian."""
-
-    def __init__(
-        self,
-        mpc: MPC,
-        candidates: Array,
-        *,
-        n_starts: int,
-        tolerance: float,
-        max_iterations: int,
-        max_time: float,
-        stagewise: bool = False,
-    ) -> None:
-        self._mpc, self._candidates, self._n_starts = mpc, candidates, n_starts
-        self._problem = Transcription(mpc, stagewise)
-        common = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
-        if np.isfinite(max_time):
-            common["max_wall_time"] = max_time / (n_starts + 2)
-        warm = {"warm_start_init_point": "yes", "mu_init": 1e-4}
-        self._cold = _ipopt("cold", self._problem, common, {"hess_lag": _cost_curvature(self._problem)})
-        self._exact = _ipopt("exact", self._problem, common | warm, {})
-
-    def solve(self, state: Array, theta: Array, u0: Array | None, guess: tuple[Array, Array] | None) -> Found:
-        """One problem: warm from a guess if that works, else cold from several starts and polished."""
-        iterations = 0
-        p = np.r_[state, theta.ravel()]  # theta (N + 1, size) by rows is CasADi's (size, N + 1) by columns
-        if guess is not None:
-            warm = self._call(self._exact, p, u0, guess)
-            if warm.success:
-                return warm
-            iterations = warm.iterations
-        attempts = [self._call(self._cold, p, u0, start) for start in self._starts(state, theta, u0)]
-        best = min(attempts, key=lambda attempt: (not attempt.success, attempt.violation, attempt.value))
-        polished = self._call(self._exact, p, u0, (best.x, best.u))
-        iterations += sum(attempt.iterations for attempt in [*attempts, polished])
-        if polished.success and (not best.success or polished.value <= best.value + 1e-6 * (1.0 + abs(best.value))):
-            best = polished
-        return replace(best, iterations=iterations)
-
-    def excess(self, state: Array, u: Array, theta: Array) -> float:
-        """By how much a plan violates a hard constraint; zero within the tolerance, inf if it is not finite."""
-        p = np.r_[state, theta.ravel()]
-        x = np.vstack([state, self._problem.simulate(u.T, p).full().T])
-        if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return np.inf
-        violation, _ = self._problem.violation(self._problem.pack(x, u, p), p)
-        return 0.0 if violation <= _tolerated(x) else violation
-
-    def _starts(self, state: Array, theta: Array, u0: Array | None) -> list[tuple[Array, Array]]:
-        """The ``n_starts`` cheapest of the candidate input sequences, with the states that they lead to."""
-        inputs = self._candidates.copy()
-        if u0 is not None:
-            inputs[:, 0] = u0
-        n, horizon, nu = inputs.shape
-        along = np.broadcast_to(theta, (horizon + 1, theta.shape[-1])).T
-        states, costs = self._problem.rollout_candidates(state, inputs.reshape(n * horizon, nu).T, along)
-        trajectories = states.full().T.reshape(n, horizon, self._mpc.nx)
-        cost = np.nan_to_num(costs.full().ravel(), nan=np.inf, posinf=np.inf)
-        order = np.argsort(cost, kind="stable")[: self._n_starts]
-        first = np.broadcast_to(state, (1, self._mpc.nx))
-        return [
-            (np.concatenate([first, trajectories[i]]), inputs[i]) for i in order if np.isfinite(trajectories[i]).all()
-        ] or [(np.repeat(first, horizon + 1, axis=0), inputs[0])]
-
-    def _call(self, solver: ca.Function, p: Array, u0: Array | None, guess: tuple[Array, Array]) -> Found:
-        """One run of ipopt, and the tests of what it returned."""
-        problem, mpc = self._problem, self._mpc
-        low, high = problem.bounds(u0)
-        start = problem.pack(*guess, p)
-        result = solver(x0=start, lbx=low, ubx=high, lbg=problem.constraint_low, ubg=0.0, p=p)
-        stats = solver.stats()
-        w = result["x"].full().ravel()
-        planned, u = problem.unpack(w)
-        u = np.clip(u, np.asarray(mpc.action_low), np.asarray(mpc.action_high))  # ipopt relaxes bounds by 1e-8
-        simulated = problem.simulate(u.T, p).full().T
-        followed = bool(np.isfinite(simulated).all())
-        x = np.vstack([p[: mpc.nx], simulated if followed else planned])
-        point = problem.pack(x, u, p)
-        value = float(problem.appraise(point, p)[0])
-        violation, where = problem.violation(point, p)
-        multipliers = Multipliers(result["lam_x"].full().ravel(), result["lam_g"].full().ravel())
-        residual = problem.optimality(point, p, u0, multipliers)
-        status = str(stats["return_status"])
-        if not (followed and np.isfinite(value)):
-            failure = "the model run with the inputs found is not finite"
-        elif not violation <= _tolerated(x):
-            failure = f"{where} is violated by {violation:.3g}"
-        elif not residual <= _OPTIMALITY_TOLERANCE:
-            failure = f"not optimal, the first-order conditions leave {residual:.1e}"
-        else:
-            failure = ""
-        words = f"{status}: {failure}" if failure else status
-        return Found(x, u, value, not failure, words, int(stats["iter_count"]), residual, violation)
-
-
-def _tolerated(x: Array) -> float:
-    """The violation of a constraint that still counts as none."""
-    return _FEASIBILITY_TOLERANCE * (1.0 + float(np.abs(x).max()))
-
-
-def _cost_curvature(problem: Transcription) -> ca.Function:
-    """The Gauss-Newton Hessian for ipopt: the curvature of the cost, without that of the constraints."""
-    hessian, _ = ca.hessian(problem.cost, problem.variables)
-    cost_factor, multipliers = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", problem.constraints.numel())
-    return ca.Function(
-        "nlp_hess_l",
-        [problem.variables, problem.parameters, cost_factor, multipliers],
-        [ca.triu(cost_factor * hessian)],
-        ["x", "p", "lam_f", "lam_g"],
-        ["triu_hess_gamma_x_x"],
-    )
-
-
-def _ipopt(name: str, problem: Transcription, options: dict[str, Any], extra: dict[str, Any]) -> ca.Function:
-    quiet = {"print_time": False, "show_eval_warnings": False, "record_time": False, "calc_lam_p": False}
-    nlp = {"x": problem.variables, "f": problem.cost, "g": problem.constraints, "p": problem.parameters}
-    return ca.nlpsol(name, "ipopt", nlp, quiet | {"ipopt": options} | extra)

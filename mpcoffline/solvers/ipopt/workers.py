@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
-from mpcoffline.core.parallel import Workers, n_cpus
+from mpcoffline.core.parallel import EXECUTORS, Executor, n_cpus
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import Array, Plan
 
-if TYPE_CHECKING:
-    from .solver import Found
+from .program import Found, Programs
 
 _PARTS = 4  # parts of a batch a worker, as some problems take longer than others
 
@@ -28,7 +26,7 @@ class _Part(NamedTuple):
 
 
 class WorkerPool:
-    """Processes that each build an :class:`IpoptSolver` of the MPC once and keep it for all batches.
+    """Processes that each build the programs of the MPC once and keep them for all batches.
 
     Args:
         mpc: The problem.
@@ -36,19 +34,12 @@ class WorkerPool:
         n_workers: Number of processes, at most; there are never more than processors or problems.
 
     Raises:
-        InvalidArgumentError: For an MPC that cannot be written to JSON, which is how it travels.
+        InvalidArgumentError: For an MPC of more than plain arithmetic, as it travels as JSON.
     """
 
     def __init__(self, mpc: MPC, options: Mapping[str, Any], n_workers: int) -> None:
-        try:
-            document = mpc.to_json()
-            MPC.from_json(document)
-        except (MPCOfflineError, AttributeError) as error:
-            raise InvalidArgumentError(
-                "n_workers", expected="1 for an MPC that has no JSON form", actual=f"{n_workers} ({error})"
-            ) from error
-        self._task, self._n_workers = _Task(document, dict(options)), n_workers
-        self._workers: Workers[_Part, list[Found]] | None = None
+        self._task, self._n_workers = _Task(mpc.to_json(portable=True), dict(options)), n_workers
+        self._workers: Executor[_Part, list[Found]] | None = None
         self._n_started, self._process = 0, os.getpid()
 
     def solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan) -> list[Found]:
@@ -70,13 +61,13 @@ class WorkerPool:
         wanted = min(self._n_workers, n, n_cpus())
         if self._workers is None or wanted > self._n_started:
             self.close()
-            self._workers, self._n_started = Workers(self._task, wanted), wanted
+            self._workers, self._n_started = EXECUTORS["processes"](self._task, wanted), wanted
         try:
-            found = dict(self._workers.run(jobs))
+            found = self._workers.map(jobs)
         except BaseException:  # Ctrl-C, a worker that died: no process stays behind, the next batch starts new ones
             self.close()
             raise
-        return [one for name in jobs for one in found[name]]
+        return [one for part in found for one in part]
 
     def close(self) -> None:
         """Ends the processes."""
@@ -86,16 +77,13 @@ class WorkerPool:
 
 
 class _Task:
-    """What a worker does with a part; unpickled once a process, it keeps its solver."""
+    """What a worker does with a part; unpickled once a process, it keeps its programs."""
 
     def __init__(self, document: dict[str, Any], options: dict[str, Any]) -> None:
         self._document, self._options = document, options
-        self._solver: Any = None
+        self._programs: Programs | None = None
 
     def __call__(self, part: _Part) -> list[Found]:
-        if self._solver is None:
-            from .solver import IpoptSolver
-
-            self._solver = IpoptSolver(MPC.from_json(self._document), **self._options)
-        found: list[Found] = self._solver.solve_each(*part)
-        return found
+        if self._programs is None:
+            self._programs = Programs(MPC.from_json(self._document), self._options)
+        return self._programs.solve(*part)

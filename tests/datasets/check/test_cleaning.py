@@ -11,8 +11,10 @@ import tempfile
 from pathlib import Path
 from typing import Any, cast
 
+import crashing
 import numpy as np
 import pytest
+from crashing import recording
 from filelock import FileLock
 from typer.testing import CliRunner
 
@@ -21,7 +23,11 @@ from mpcoffline.core import places
 from mpcoffline.core.errors import UnknownIdError
 from mpcoffline.datasets import clean, dataset_from_arrays, list_datasets, load_dataset
 from mpcoffline.datasets.check.cleaning import Kind
+from mpcoffline.datasets.record import recording as module_of_recording
+from mpcoffline.datasets.record.recording import Recording
 from mpcoffline.datasets.store.recording_lock import RecordingLock
+
+SPACES = {"observation_space": crashing.SPACE, "action_space": crashing.ACTIONS}
 
 
 @pytest.fixture(autouse=True)
@@ -43,9 +49,9 @@ def episode(steps: int = 20) -> tuple[Any, Any, Any]:
 STORING = """
 import os, signal
 import numpy as np
-from mpcoffline.datasets import minari_store
+from mpcoffline.datasets.store import writing
 from mpcoffline.datasets import dataset_from_arrays
-minari_store.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
+writing.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
 dataset_from_arrays("mine/plant/log-v0", [(np.zeros((21, 3)), np.zeros((20, 1)), np.zeros(20))])
 """
 
@@ -182,3 +188,27 @@ def test_recordings_that_were_put_aside_are_backups(tmp_path: Path, monkeypatch:
     assert kept.exists()
     clean(["backups"], remove_found=True)
     assert not (tmp_path / ".broken").exists()
+
+
+def test_logs_that_are_in_their_data_set_go(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed after the data set got its name and before the logs were removed; another recording's logs stay."""
+    sealed, opened = recording(), Recording("test/open-v0", env_spec=None, **SPACES)
+    for recorded in (sealed, opened):
+        recorded.append(0, crashing.episode(0), complete=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(module_of_recording, "remove_logs", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            sealed.seal()
+    for recorded in (sealed, opened):
+        recorded.close()
+    root = machine / "store" / ".recording"
+    (found,) = clean(["leftovers"]).found
+    assert found.path == root / crashing.DATASET
+    assert clean(["leftovers"], remove_found=True).found[0].removed
+    assert not list(root.glob(f"{crashing.DATASET}/*.log"))
+    assert len(list(root.glob("test/open-v0/*.log"))) == 1
+    assert load_dataset(crashing.DATASET).total_episodes == 1
+
+
+def interrupt(dataset_id: str) -> None:
+    raise KeyboardInterrupt

@@ -142,6 +142,14 @@ def test_changed_numbers_are_never_intact_and_never_sealed_in_silence(store: Pat
     assert any(f"{DATA_FILE} is not what {MANIFEST} says: numbers" in note for note in report.notes)
 
 
+def test_sums_that_cannot_be_read_leave_the_rest_to_be_repaired(store: Path) -> None:
+    stored()
+    (store / ID / "data" / "metadata.json").unlink()
+    (store / ID / MANIFEST).unlink()
+    (store / ID / MANIFEST).symlink_to(MANIFEST)  # to itself
+    assert any(note.startswith("Whether numbers have changed is unknown") for note in repair(ID).notes)
+
+
 def test_lost_metadata_over_sound_data_are_no_change_of_numbers(store: Path) -> None:
     stored()
     (store / ID / "data" / "metadata.json").unlink()

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.datasets.check.replaying import recover_environment, replay
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.envs import ENV_IDS
 
 LINEAR = "mpcoffline/LinearTracking-v0"
@@ -38,6 +38,7 @@ def test_what_was_recorded_here_is_repeated_bit_for_bit(env_id: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_shipped_data_are_repeated() -> None:
     report = replay("mpcoffline/pendulum/ddpg-v0", n_episodes=5)
     assert report.ok

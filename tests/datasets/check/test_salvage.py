@@ -18,7 +18,7 @@ from mpcoffline.cli.main import app
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets import repair
 from mpcoffline.datasets.record.episode_log import EpisodeLog, scan
-from mpcoffline.datasets.record.log_records import LoggedEpisode, LogHeader
+from mpcoffline.datasets.record.log_format import LoggedEpisode, LogHeader
 from mpcoffline.datasets.store.recording_lock import log_files
 
 HEADER = LogHeader("test/log-v0", "name", "new", "{}", "{}")

@@ -13,7 +13,7 @@ from minari.data_collector import EpisodeBuffer
 
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.datasets import record, replay
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 

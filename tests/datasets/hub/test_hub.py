@@ -22,9 +22,9 @@ from stand_in_hub import Hub, stand_in_hub
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError, UnknownIdError
 from mpcoffline.datasets.hub import remotes
 from mpcoffline.datasets.hub import transfer as hub_module
+from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.hub.remotes import RemoteError
 from mpcoffline.datasets.hub.transfer import download_dataset, find_source, upload_dataset
-from mpcoffline.datasets.store.local import load_dataset
 from mpcoffline.datasets.store.manifest import MANIFEST, write_manifest
 
 pytest.importorskip("huggingface_hub", reason='downloads from Hugging Face need pip install "mpcoffline[hub]"')

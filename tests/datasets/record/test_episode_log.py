@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mpcoffline.core.errors import FileFormatError
-from mpcoffline.datasets.record import episode_log, log_records
+from mpcoffline.datasets.record import episode_log, log_format
 from mpcoffline.datasets.record.episode_log import EpisodeLog, scan
-from mpcoffline.datasets.record.log_records import LoggedEpisode, LogHeader
+from mpcoffline.datasets.record.log_format import LoggedEpisode, LogHeader
 
 HEADER = LogHeader("test/log-v0", "name", "new", "{}", "{}")
 
@@ -51,8 +51,8 @@ def test_there_and_back(tmp_path: Path) -> None:
 
 def first_end(begin: int) -> int:
     """Where the first episode ends, behind which the header comes again."""
-    content = log_records.encode(LoggedEpisode.of(episode(0), 0, complete=True))
-    return begin + len(log_records.record(log_records.EPISODE, content, begin))
+    content = log_format.encode(LoggedEpisode.of(episode(0), 0, complete=True))
+    return begin + len(log_format.framed(log_format.EPISODE, content, begin))
 
 
 def test_every_torn_tail_ends_before_the_torn_episode(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def read_all(path: Path) -> list[LoggedEpisode]:
 @given(content=st.binary(max_size=200), magic=st.booleans())
 def test_any_bytes_at_all(tmp_path: Path, content: bytes, magic: bool) -> None:
     path = tmp_path / "x.log"
-    path.write_bytes(log_records.MAGIC * magic + content)
+    path.write_bytes(log_format.MAGIC * magic + content)
     assert read_all(path) == []
 
 
@@ -161,7 +161,7 @@ def test_a_record_with_the_right_crc_and_the_wrong_content(tmp_path: Path, descr
     text = json.dumps(description).encode()
     content = len(text).to_bytes(4, "little") + text + bytes(40)
     with path.open("ab") as file:
-        file.write(log_records.record(log_records.EPISODE, content, file.tell()))
+        file.write(log_format.framed(log_format.EPISODE, content, file.tell()))
     with pytest.raises(FileFormatError, match=r"record at byte \d+: expected an episode"):
         list(scan(path).episodes())
     path.unlink()
@@ -171,6 +171,6 @@ def test_a_record_with_the_right_crc_and_the_wrong_content(tmp_path: Path, descr
 @given(values=JSON | st.dictionaries(st.sampled_from(["version", "dataset_id", "mode"]), JSON))
 def test_a_header_with_the_right_crc_and_the_wrong_content(tmp_path: Path, values: object) -> None:
     path = tmp_path / "h.log"
-    path.write_bytes(log_records.MAGIC + log_records.record(log_records.HEADER, json.dumps(values).encode(), 8))
+    path.write_bytes(log_format.MAGIC + log_format.framed(log_format.HEADER, json.dumps(values).encode(), 8))
     with pytest.raises(FileFormatError):
         scan(path)

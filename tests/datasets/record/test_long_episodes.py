@@ -14,7 +14,7 @@ from crashing import run_and_kill
 from stable_baselines3 import DDPG
 
 from mpcoffline.datasets import MinariRecorder, record, repair
-from mpcoffline.datasets.record import episodes
+from mpcoffline.datasets.record import episode_builder
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 LONG = "test/long-v0"
@@ -23,7 +23,7 @@ LONG = "test/long-v0"
 @pytest.fixture(autouse=True)
 def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of 16 steps."""
-    monkeypatch.setattr(episodes, "PIECE_STEPS", 16)
+    monkeypatch.setattr(episode_builder, "PIECE_STEPS", 16)
 
 
 def columns(dataset_id: str) -> list[np.ndarray[Any, Any]]:
@@ -41,7 +41,7 @@ def test_pieces_make_the_same_episode(steps: int, monkeypatch: pytest.MonkeyPatc
         record(env, lambda observation: np.clip(-observation[1:2], -2, 2), 2, dataset_id, seed=0)
 
     run(LONG)
-    monkeypatch.setattr(episodes, "PIECE_STEPS", 10**9)
+    monkeypatch.setattr(episode_builder, "PIECE_STEPS", 10**9)
     run("test/whole-v0")
     for found, wanted in zip(columns(LONG), columns("test/whole-v0"), strict=True):
         np.testing.assert_array_equal(found, wanted)
@@ -55,7 +55,7 @@ def test_a_recorder_writes_pieces_of_every_environment(monkeypatch: pytest.Monke
         return recorder.returns
 
     returns = run(LONG)
-    monkeypatch.setattr(episodes, "PIECE_STEPS", 10**9)
+    monkeypatch.setattr(episode_builder, "PIECE_STEPS", 10**9)
     np.testing.assert_allclose(returns, run("test/whole-v0"), rtol=1e-12)
     for found, wanted in zip(columns(LONG), columns("test/whole-v0"), strict=True):
         np.testing.assert_array_equal(found, wanted)

@@ -19,6 +19,7 @@ from mpcoffline.control.evaluation import evaluate
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.datasets import record
+from mpcoffline.datasets.check.rebuilding import rebuilt_spec
 from mpcoffline.datasets.record.plants import MAX_EPISODE_STEPS
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.sb3.model import EnvironmentEvaluator, MPCModel
@@ -237,6 +238,42 @@ def test_attributes_that_were_set_count() -> None:
     for start in (None, {"state": [1.0, 0.5]}):
         found, expected = (evaluate(Zero(0.5), env, 2, options=start).cost for env in (changed, made))
         np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def _weighted(weight: float) -> Any:
+    return lambda k, cost: {"weight": weight}
+
+
+class _Weights:
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+
+    def info(self, k: int, cost: float) -> dict[str, Any]:
+        return {"weight": self.weight}
+
+
+class _Weighted(Drift):
+    """Functions that hold something: a closure, a method of another object, and what holds the plant itself."""
+
+    def __init__(self) -> None:
+        super().__init__(info=_weighted(1.0))
+        self.other, self.own, self.within = _Weights(1.0).info, self._observed, lambda: self.x
+
+
+def test_what_functions_hold_counts() -> None:
+    gym.register("test/Weighted-v0", _Weighted)
+    try:
+        assert rebuilt_spec(gym.make("test/Weighted-v0")) is not None
+        for name, same, other in (
+            ("info", _weighted(1.0), _weighted(5.0)),
+            ("other", _Weights(1.0).info, _Weights(5.0).info),
+        ):
+            for value, rebuilt in ((same, True), (other, False)):
+                env = gym.make("test/Weighted-v0")
+                setattr(env.unwrapped, name, value)
+                assert (rebuilt_spec(env) is not None) == rebuilt
+    finally:
+        gym.registry.pop("test/Weighted-v0")
 
 
 def test_what_cannot_be_rebuilt_is_stepped_itself(drift: str) -> None:

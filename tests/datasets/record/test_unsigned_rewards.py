@@ -10,7 +10,7 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from mpcoffline import TransitionTable
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.gallery import show
 
 

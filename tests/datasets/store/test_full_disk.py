@@ -18,14 +18,15 @@ import pytest
 from crashing import ACTIONS, DATASET, SPACE, check_survivors, episode, recording
 from hypothesis import given
 from hypothesis import strategies as st
+from pendulum_data import recorded, stored
 
 from mpcoffline.core.errors import StorageError
 from mpcoffline.datasets import dataset_from_arrays, repair
 from mpcoffline.datasets.record.recording import Recording
-from mpcoffline.datasets.store import writing
+from mpcoffline.datasets.store import hdf5_writing
+from mpcoffline.datasets.store.hdf5_writing import SteadyFile, write_steadily
 from mpcoffline.datasets.store.packed import pack, packed_size
 from mpcoffline.datasets.store.recording_lock import log_files
-from mpcoffline.datasets.store.writing import SteadyFile, write_steadily
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def limit() -> Iterator[Any]:
 def route(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Data sets are made in memory, or (as large ones are) through a file that takes everything."""
     if request.param == "steadily":
-        monkeypatch.setattr(writing, "IN_MEMORY", 0)
+        monkeypatch.setattr(hdf5_writing, "IN_MEMORY", 0)
     return str(request.param)
 
 
@@ -100,12 +101,10 @@ def test_a_replaced_data_set_stays(limit: Any) -> None:
 
 
 def test_a_packed_file_stays(limit: Any, tmp_path: Path) -> None:
-    from mpcoffline.datasets import load_dataset
-
-    dataset = load_dataset("mpcoffline/linear/ddpg-v0")
+    dataset = stored(episodes=recorded(length=1_000))
     path = tmp_path / "packed.h5"
     path.write_bytes(b"before")
-    limit(100_000)
+    limit(10_000)
     with pytest.raises(StorageError):
         pack(dataset, path)
     assert path.read_bytes() == b"before"
@@ -159,7 +158,7 @@ def test_it_reads_back_what_was_written_whatever_the_disk_says(
     real = os.pwrite
     with pytest.MonkeyPatch.context() as patch, SteadyFile(path) as file:
         patch.setattr(os, "pwrite", pwrite)
-        patch.setattr(writing, "WINDOW", window)
+        patch.setattr(hdf5_writing, "WINDOW", window)
         for kind, place, data in steps:
             file.seek(place)
             if kind == "write" and data:
@@ -197,9 +196,25 @@ def test_repair_needs_room_too(limit: Any, store: Path) -> None:
     assert check_survivors(5) == 5
 
 
+@pytest.mark.parametrize("size", [0, 3_000, 20_000])
+def test_a_rebuild_needs_room_too(size: int, limit: Any, store: Path) -> None:
+    recorded = recording()
+    for number in range(20):
+        recorded.append(0, episode(number), complete=True)
+    recorded.seal()
+    (store / DATASET / "data" / "metadata.json").unlink()
+    before = {path: path.read_bytes() for path in files(store) if path.is_file()}
+    limit(size)
+    with pytest.raises(StorageError, match=r"expected to be written, got File too large.*Free some"):
+        repair(DATASET)
+    limit(resource.RLIM_INFINITY)
+    assert {path: path.read_bytes() for path in files(store) if path.is_file()} == before
+    assert repair(DATASET).episodes == 20
+
+
 def test_both_routes_store_the_same(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for version, limit in enumerate((writing.IN_MEMORY, 2_000, 0)):
-        monkeypatch.setattr(writing, "IN_MEMORY", limit)
+    for version, limit in enumerate((hdf5_writing.IN_MEMORY, 2_000, 0)):
+        monkeypatch.setattr(hdf5_writing, "IN_MEMORY", limit)
         name = f"test/routes-v{version}"
         for first in (0, 5):  # new, then more of it
             more = recording_of(name, "extend" if first else "new")

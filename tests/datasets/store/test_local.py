@@ -18,10 +18,11 @@ from pendulum_data import recorded, stored
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.datasets import TransitionTable, list_datasets, load_dataset
-from mpcoffline.datasets.recipes import TASKS, Recipe, catalog_file
-from mpcoffline.datasets.store import local as minari_store
-from mpcoffline.datasets.store.local import shipped_datasets, write_dataset
+from mpcoffline.datasets.recipes import Recipe, catalog_file, recorded_tasks
+from mpcoffline.datasets.store import local
+from mpcoffline.datasets.store.local import shipped_datasets
 from mpcoffline.datasets.store.packed import pack, packed_size, unpack
+from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.envs import ControlTask
 
 SHIPPED = ["mpcoffline/cartpole/ddpg-v0", "mpcoffline/linear/ddpg-v0", "mpcoffline/pendulum/ddpg-v0"]
@@ -68,7 +69,11 @@ def test_shipped_data_are_500_episodes_that_the_environment_repeats(dataset_id: 
 def test_checksums_are_those_of_the_files() -> None:
     lines = catalog_file("SHA256SUMS").read_text(encoding="utf-8").splitlines()
     listed = {name: digest for digest, name in (line.split("  ") for line in lines)}
-    assert set(listed) == set(shipped_datasets().values()) == {f"{task}.h5" for task in TASKS}
+    assert (
+        set(listed)
+        == {f"{task}.h5" for task in shipped_datasets().values()}
+        == {f"{task}.h5" for task in recorded_tasks()}
+    )
     for name, digest in listed.items():
         content = catalog_file(name).read_bytes()
         assert hashlib.sha256(content).hexdigest() == digest
@@ -83,7 +88,7 @@ def test_a_shipped_file_that_is_not_the_one_shipped_is_refused(
     content = bytearray((tmp_path / "pendulum.h5").read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / "pendulum.h5").write_bytes(content)
-    monkeypatch.setattr(minari_store, "catalog_file", lambda name: tmp_path / name)
+    monkeypatch.setattr(local, "catalog_file", lambda name, task=None: tmp_path / name)
     with pytest.raises(FileFormatError, match=r"pendulum.h5: expected sha256 .* Reinstall"):
         load_dataset("mpcoffline/pendulum/ddpg-v0")
     assert not [path for path in store.rglob("*") if path.is_file()]

@@ -35,6 +35,21 @@ def test_a_manifest_is_what_sha256sum_reads(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == [MANIFEST, "data"]
 
 
+def test_a_link_in_its_place_leads_nothing_elsewhere(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("kept")
+    (folder / MANIFEST).unlink()
+    (folder / MANIFEST).symlink_to(tmp_path / "precious")
+    write_manifest(folder)
+    assert (tmp_path / "precious").read_text() == "kept"
+    assert not (folder / MANIFEST).is_symlink()
+    assert differences(folder) == []
+
+
+def test_only_what_is_named_is_listed(folder: Path) -> None:
+    write_manifest(folder, ["data/metadata.json"])
+    assert list(read_manifest(folder)) == ["data/metadata.json"]
+
+
 def test_each_difference_is_named(folder: Path) -> None:
     content = bytearray((folder / "data" / "main_data.hdf5").read_bytes())
     content[77] ^= 1

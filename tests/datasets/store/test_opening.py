@@ -280,7 +280,7 @@ def test_ids_of_other_types_are_named(given: Any, read: Callable[[Any], Any]) ->
 
 
 def test_a_damaged_set_is_not_extended(store: Path) -> None:
-    from mpcoffline.datasets.store.local import write_dataset
+    from mpcoffline.datasets.store.writing import write_dataset
 
     dataset = stored()
     flipped(store)

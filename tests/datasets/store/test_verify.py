@@ -44,6 +44,7 @@ def test_an_intact_data_set_passes(store: Path, with_manifest: bool) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shipped")
 def test_a_shipped_data_set_passes() -> None:
     report = verify("mpcoffline/pendulum/ddpg-v0")
     assert (report.ok, report.findings, report.episodes, report.steps) == (True, (), 500, 50_000)

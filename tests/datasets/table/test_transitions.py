@@ -20,7 +20,7 @@ from pendulum_data import resealed
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.datasets.store.local import write_dataset
+from mpcoffline.datasets.store.writing import write_dataset
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
@@ -280,3 +280,48 @@ def test_importing_the_package_stays_light() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
+
+
+def numbered(lengths: list[int], ids: list[int]) -> TransitionTable:
+    """A table whose row k holds s = k."""
+    k = np.arange(float(sum(lengths)))[:, None]
+    return TransitionTable.from_arrays(
+        k, -k, k[:, 0], k + 1, np.zeros(len(k)), np.repeat(ids, lengths), name="numbered"
+    )
+
+
+def test_episodes_lie_where_they_say() -> None:
+    table = numbered([3, 1, 4], [7, 2, 5])
+    assert [part.tolist() for part in table.episodes] == [[2, 5, 7], [3, 4, 0], [1, 4, 3]]
+    assert table.n_episodes == 3
+    for number, wanted in ((0, [3]), (1, [4, 5, 6, 7]), (2, [0, 1, 2]), (-1, [0, 1, 2])):
+        part = table.take(table.episodes.rows(number))
+        assert part.observations[:, 0].tolist() == wanted
+        assert part.n_episodes == 1
+
+
+def test_rows_are_taken_in_the_order_asked_for() -> None:
+    table = numbered([3, 1, 4], [7, 2, 5])
+    taken = table.take(np.array([6, 0, 0]))
+    assert taken.observations[:, 0].tolist() == [6, 0, 0]
+    assert taken.next_observations[:, 0].tolist() == [7, 1, 1]
+    assert taken.episode_ids.tolist() == [5, 7, 7]
+    assert taken.name == "numbered"
+
+
+def test_a_sample_has_each_row_once_and_in_order() -> None:
+    table = numbered([100], [0])
+    times = np.zeros(100)
+    for seed in range(500):
+        drawn = table.sample(20, seed).observations[:, 0].astype(int)
+        assert len(drawn) == 20
+        assert (np.diff(drawn) > 0).all()
+        times[drawn] += 1
+    assert abs(times - 100.0).max() < 5 * np.sqrt(100 * 0.8)  # every row alike: binomial of 500 draws at 1/5
+    np.testing.assert_array_equal(table.sample(20, 3).rows, table.sample(20, np.random.default_rng(3)).rows)
+    np.testing.assert_array_equal(table.sample(1000, 0).rows, table.rows)
+    generator = np.random.default_rng(3)
+    first, second = (table.sample(20, generator).rows for _ in range(2))
+    assert not np.array_equal(first, second)
+    with pytest.raises(InvalidArgumentError, match="count: expected a positive integer, got 0"):
+        table.sample(0, 0)

@@ -13,8 +13,8 @@ import torch
 from lq_plant import BEST, QuadraticValue
 
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.learning import FitConfig, ParameterTraining
-from mpcoffline.learning.bellman.equation import BellmanFit, PredictionError
+from mpcoffline.learning import ParameterConfig, ParameterTraining
+from mpcoffline.learning.bellman.equation import BellmanProblem, PredictionError
 from mpcoffline.mpc import MPC, Model, Parameter
 
 BOTH = ("cost", "model")
@@ -22,20 +22,20 @@ WRONG = (0.5 * lq_plant.A, 2.0 * lq_plant.B)
 
 
 def training(mpc: MPC | None = None, groups: tuple[str, ...] = BOTH, **options: Any) -> ParameterTraining:
-    config = FitConfig(**({"n_steps": 60, "batch_size": 64, "refit_iterations": 50} | options))
+    config = ParameterConfig(**({"n_steps": 60, "batch_size": 64, "refit_iterations": 50} | options))
     value = QuadraticValue(BEST.P)
     return ParameterTraining(mpc or lq_plant.make_mpc(), value, lq_plant.random_log(400), groups, config, seed=0)
 
 
 def test_going_on_after_a_skipped_step_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    honest, calls = BellmanFit.error, 0
+    honest, calls = BellmanProblem.error, 0
 
-    def faulty(self: BellmanFit, batch: Any, theta: torch.Tensor) -> torch.Tensor:
+    def faulty(self: BellmanProblem, batch: Any, theta: torch.Tensor) -> torch.Tensor:
         nonlocal calls
         calls += theta.requires_grad
         return honest(self, batch, theta) * (torch.nan if theta.requires_grad and calls == 5 else 1.0)
 
-    monkeypatch.setattr(BellmanFit, "error", faulty)
+    monkeypatch.setattr(BellmanProblem, "error", faulty)
     whole = training()
     whole.advance(20)
     arrays = whole.to_arrays()
@@ -48,8 +48,8 @@ def test_going_on_after_a_skipped_step_gives_the_same_bits(monkeypatch: pytest.M
 
 def test_no_finite_gradient_at_all_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     fit = training()
-    honest = BellmanFit.error
-    monkeypatch.setattr(BellmanFit, "error", lambda *arguments: torch.nan * honest(*arguments))
+    honest = BellmanProblem.error
+    monkeypatch.setattr(BellmanProblem, "error", lambda *arguments: torch.nan * honest(*arguments))
     fit.advance(5)
     assert "(FIT) did not move in 5 steps: no gradient was finite" in caplog.text
 
@@ -73,7 +73,7 @@ def test_going_on_gives_the_same_bits(stops: tuple[int, ...]) -> None:
 
 def test_the_prediction_error_is_its_formula() -> None:
     mpc, table = lq_plant.make_mpc(), lq_plant.random_log(200)
-    problem = BellmanFit(mpc, QuadraticValue(BEST.P), 1.0)
+    problem = BellmanProblem(mpc, QuadraticValue(BEST.P), 1.0)
     sample = table.columns(torch.from_numpy(table.rows))
     s, a, reached = (
         np.asarray(c, dtype=np.float64) for c in (table.observations, table.actions, table.next_observations)
@@ -104,7 +104,7 @@ def test_full_turns_of_a_wrapped_angle_are_no_prediction_error() -> None:
         sample = table.columns(torch.from_numpy(table.rows))
         theta = torch.from_numpy(mpc.theta)
         errors.append(
-            float(PredictionError(BellmanFit(mpc, QuadraticValue(BEST.P), 1.0), sample, theta)(sample, theta))
+            float(PredictionError(BellmanProblem(mpc, QuadraticValue(BEST.P), 1.0), sample, theta)(sample, theta))
         )
     assert errors[1] == pytest.approx(errors[0], rel=1e-4)
 

@@ -11,13 +11,13 @@ import torch
 from lq_plant import BEST, DISCOUNT, MODEL_A, MODEL_B, QuadraticValue
 from riccati import optimum
 
-from mpcoffline.learning import FitConfig, FitResult, fit_parameters
+from mpcoffline.learning import FitResult, ParameterConfig, fit_parameters
 from mpcoffline.learning.bellman.potential import Potential
 from mpcoffline.mpc import MPC
 
 
 def fitted(mpc: MPC, *, potential: bool) -> FitResult:
-    config = FitConfig(prior=0.0, potential=potential, refit_iterations=2_000)
+    config = ParameterConfig(prior=0.0, potential=potential, refit_iterations=2_000)
     return fit_parameters(mpc, QuadraticValue(BEST.P), lq_plant.random_log(2_000), ("cost",), config, seed=0)
 
 
@@ -83,7 +83,7 @@ def test_after_a_terminal_state_it_vanishes(share: float) -> None:
     rows = table.rows.copy()
     rows[:, -1] = share
     ended = type(table)(rows, 2, 1, table.episode_ids)
-    config = FitConfig(prior=1e-9, potential=True)
+    config = ParameterConfig(prior=1e-9, potential=True)
     result = fit_parameters(lq_plant.make_mpc(), QuadraticValue(BEST.P), ended, ("cost",), config, seed=0)
     assert np.isfinite(result.theta).all()
     assert result.loss_after < (1e-6 if share else 1e-3)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.learning import FitConfig, FitResult, ValueFunction, fit_parameters
-from mpcoffline.learning.bellman.equation import BellmanFit
+from mpcoffline.learning import FitResult, ParameterConfig, ValueFunction, fit_parameters
+from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 from mpcoffline.plants.nominal import nominal_mpc
@@ -49,7 +49,7 @@ def network(table: TransitionTable, seed: int = 0) -> ValueFunction:
 
 
 def fit(mpc: MPC, P: Array, table: TransitionTable, groups: tuple[str, ...], **options: Any) -> FitResult:
-    return fit_parameters(mpc, QuadraticValue(P), table, groups, FitConfig(**options), seed=0)
+    return fit_parameters(mpc, QuadraticValue(P), table, groups, ParameterConfig(**options), seed=0)
 
 
 # ---------------------------------------------------------------- the error
@@ -67,14 +67,14 @@ def test_the_error_is_its_formula_evaluated_by_casadi_and_numpy(env_id: str) -> 
     alive = 1.0 - columns.terminations
     bellman = value.predict(columns.next_observations) - value.predict(predicted)
     residual = columns.costs + mpc.discount * alive * bellman - stage
-    problem = BellmanFit(mpc, value, unit)
+    problem = BellmanProblem(mpc, value, unit)
     found = problem.error(table.columns(torch.from_numpy(table.rows)), torch.from_numpy(theta))
     assert float(found) == pytest.approx(float(np.mean(residual**2)) / unit, rel=1e-5)
 
 
 def test_the_errors_gradient_is_its_slope() -> None:
     mpc, table = nominal_mpc(SWING_UPS[0], alpha=0.5, seed=0), swing_up_log(SWING_UPS[0])
-    problem, coordinates = BellmanFit(mpc, network(table).double(), 1.0), Coordinates(mpc, BOTH)
+    problem, coordinates = BellmanProblem(mpc, network(table).double(), 1.0), Coordinates(mpc, BOTH)
     batch = table.columns(torch.from_numpy(table.rows.astype(np.float64)))
     rng = np.random.default_rng(0)
     z = torch.from_numpy(0.1 * rng.normal(size=coordinates.size)).requires_grad_()
@@ -191,7 +191,7 @@ def test_exact_dynamics_and_cost_make_the_loss_vanish() -> None:
     """(FIT) is zero at the true (A, B, L) whatever V is."""
     mpc = lq_plant.make_mpc(model=(lq_plant.A, lq_plant.B))
     table = lq_plant.random_log(500)
-    result = fit_parameters(mpc, network(table), table, BOTH, FitConfig(n_steps=20), seed=0)
+    result = fit_parameters(mpc, network(table), table, BOTH, ParameterConfig(n_steps=20), seed=0)
     assert result.loss_before < 1e-9
     assert result.loss_after < 1e-4
 
@@ -392,7 +392,7 @@ def test_every_fit_gives_a_well_posed_mpc(seed: int, n: int, env_id: str, groups
     c = raw.columns(raw.rows)
     table = TransitionTable.from_arrays(c.observations, c.actions, -size * c.costs, c.next_observations, c.terminations)
     mpc = nominal_mpc(env_id, alpha=1.0, seed=seed)
-    config = FitConfig(n_steps=15, learning_rate=1.0, refit_iterations=30)
+    config = ParameterConfig(n_steps=15, learning_rate=1.0, refit_iterations=30)
     result = fit_parameters(mpc, network(table, seed), table, groups, config, seed=seed)
     assert np.isfinite(result.loss_after)
     assert (mpc.space.low <= result.theta).all()
@@ -405,21 +405,21 @@ def test_every_fit_gives_a_well_posed_mpc(seed: int, n: int, env_id: str, groups
 
 def test_a_gradient_that_is_not_finite_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = 0
-    honest = BellmanFit.error
+    honest = BellmanProblem.error
 
-    def faulty(self: BellmanFit, batch: Any, theta: torch.Tensor) -> torch.Tensor:
+    def faulty(self: BellmanProblem, batch: Any, theta: torch.Tensor) -> torch.Tensor:
         nonlocal calls
         calls += 1
         return honest(self, batch, theta) * (torch.nan if calls % 3 == 0 else 1.0)
 
-    monkeypatch.setattr(BellmanFit, "error", faulty)
+    monkeypatch.setattr(BellmanProblem, "error", faulty)
     reports: list[dict[str, float]] = []
     result = fit_parameters(
         lq_plant.make_mpc(),
         QuadraticValue(BEST.P),
         lq_plant.random_log(300),
         BOTH,
-        FitConfig(n_steps=50),
+        ParameterConfig(n_steps=50),
         seed=0,
         report=lambda done, total, metrics: reports.append(metrics),
     )
@@ -440,7 +440,7 @@ def test_a_model_that_is_not_finite_on_the_data_is_refused() -> None:
 
 def test_the_seed_decides_every_bit() -> None:
     table, mpc = noisy_log(600), lq_plant.make_mpc()
-    options = FitConfig(n_steps=40, batch_size=64)
+    options = ParameterConfig(n_steps=40, batch_size=64)
     first, again, other = (
         fit_parameters(mpc, QuadraticValue(BEST.P), table, BOTH, options, seed=seed) for seed in (0, 0, 1)
     )
@@ -451,7 +451,7 @@ def test_the_seed_decides_every_bit() -> None:
 
 def test_reports_lead_to_the_end() -> None:
     calls: list[tuple[int, int]] = []
-    options = FitConfig(n_steps=25, refit_iterations=10)
+    options = ParameterConfig(n_steps=25, refit_iterations=10)
     for groups in (BOTH, COST):
         fit_parameters(
             lq_plant.make_mpc(),
@@ -491,4 +491,4 @@ def test_a_large_table_is_refitted_on_a_subset() -> None:
 )
 def test_bad_configurations_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidArgumentError, match=message):
-        FitConfig(**options)
+        ParameterConfig(**options)

@@ -78,7 +78,7 @@ def chain(terminated: bool) -> TransitionTable:
     return TransitionTable.from_arrays(x, np.zeros((128, 1)), np.tile([2.0, 3.0], 64), reached, ends)
 
 
-@pytest.mark.parametrize("method", VALUE_METHODS)
+@pytest.mark.parametrize("method", ["auto", *VALUE_METHODS])
 @pytest.mark.parametrize("terminated", [True, False])
 def test_bootstrapping_stops_at_a_termination_only(method: str, terminated: bool) -> None:
     discount = 0.8

@@ -26,7 +26,7 @@ def training(device: str, **options: Any) -> ValueTraining:
 
 @pytest.mark.parametrize(
     "options",
-    [*({"method": method} for method in VALUE_METHODS), {"n_members": 3}, {"validation": 0.3}],
+    [*({"method": method} for method in ("auto", *VALUE_METHODS)), {"n_members": 3}, {"validation": 0.3}],
     ids=str,
 )
 def test_both_devices_learn_the_same_value(options: dict[str, Any]) -> None:
@@ -39,7 +39,7 @@ def test_both_devices_learn_the_same_value(options: dict[str, Any]) -> None:
     np.testing.assert_allclose(values[1], values[0], atol=0.01 * spread)  # float32, sums in another order
 
 
-@pytest.mark.parametrize("options", [{"method": method} for method in VALUE_METHODS], ids=str)
+@pytest.mark.parametrize("options", [{"method": method} for method in ("auto", *VALUE_METHODS)], ids=str)
 def test_an_interrupted_training_ends_with_the_same_bits(options: dict[str, Any]) -> None:
     whole, first, second = (training("cuda", **options) for _ in range(3))
     whole.advance(300)

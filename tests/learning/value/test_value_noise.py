@@ -45,6 +45,7 @@ def test_the_shares_are_those_of_the_noise(process: float, paid: float) -> None:
 @pytest.mark.parametrize(
     "task", ["pendulum", *(pytest.param(task, marks=pytest.mark.slow) for task in ("linear", "cartpole"))]
 )
+@pytest.mark.usefixtures("shipped")
 def test_the_logs_that_ship_are_deterministic_and_noise_on_them_is_noticed(task: str) -> None:
     table = TransitionTable.from_minari(f"mpcoffline/{task}/ddpg-v0").trim(0.9)
     clean, measured = estimate_stochasticity(table), estimate_stochasticity(noisy(table, measured=0.05))

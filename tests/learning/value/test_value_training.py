@@ -41,19 +41,25 @@ def same_arrays(found: dict[str, NDArray[Any]], wanted: dict[str, NDArray[Any]])
 
 @pytest.mark.parametrize(
     "options",
-    [*({"method": method} for method in VALUE_METHODS), {"n_members": 2}, {"validation": 0.3, "n_steps": 400}],
+    [
+        *({"method": method} for method in ("auto", *VALUE_METHODS)),
+        {"n_members": 2},
+        {"validation": 0.3, "n_steps": 400},
+    ],
 )
-@pytest.mark.parametrize("stop", [0, 7, 290])
-def test_an_interrupted_training_ends_with_the_same_bits(options: dict[str, Any], stop: int) -> None:
+def test_an_interrupted_training_ends_with_the_same_bits(options: dict[str, Any]) -> None:
+    """Whenever it is interrupted: before its first step, soon after, at its end, or (the longest) shortly before."""
     config = ValueConfig(**(TINY | options))
-    whole, first, second = training(config), training(config), training(config)
-    whole.advance(config.n_steps)
-    first.advance(stop)
-    second.restore({name: array.copy() for name, array in first.to_arrays().items()})
-    assert second.step == first.step
-    second.advance(config.n_steps)
-    same_arrays(second.to_arrays(), whole.to_arrays())
-    same_arrays(second.result.to_arrays(), whole.result.to_arrays())
+    whole, first = training(config), training(config)
+    for stop in (0, 7, 290):
+        first.advance(stop - first.step)
+        second = training(config)
+        second.restore({name: array.copy() for name, array in first.to_arrays().items()})
+        assert second.step == first.step
+        second.advance(config.n_steps)
+        whole.advance(config.n_steps - whole.step)
+        same_arrays(second.to_arrays(), whole.to_arrays())
+        same_arrays(second.result.to_arrays(), whole.result.to_arrays())
 
 
 def test_a_table_larger_than_memory_is_learned_from_and_resumed(
@@ -244,7 +250,7 @@ def test_units_of_the_state_and_constant_columns_do_not_matter() -> None:
     assert lq_plant.explained(truth, value.predict(widened(GRID))) > 0.98
 
 
-@pytest.mark.parametrize("method", VALUE_METHODS)
+@pytest.mark.parametrize("method", ["auto", *VALUE_METHODS])
 def test_fewer_rows_than_a_batch_are_enough(method: str) -> None:
     config = ValueConfig(method=method, tau=0.5, hidden=(32, 32), n_steps=400, learning_rate=1e-2, polyak=0.1)
     value = fit_value(lq_plant.policy_log(100), lq_plant.DISCOUNT, config, seed=0)

@@ -8,12 +8,13 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
-from compiling import STATE, compiler_script, libraries, tiny
+from compiling import QUICK_FLAGS, SHIPPED_FLAGS, STATE, compiled_with, compiler_script, libraries, tiny
 
 from mpcoffline.core import places
 from mpcoffline.mpc import MPC, Model, QuadraticCost
@@ -26,13 +27,24 @@ root_only = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give fil
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of compiled solvers in an empty cache; temporary files in a folder of the test's own."""
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of compiled solvers in an empty cache; temporary files in a folder of the test's own.
+
+    Where not the code that compilers make matters, but where it goes, they do not optimise it.
+    """
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
     places.warn_once.cache_clear()
-    return tmp_path / "cache" / "solvers"
+    with compiled_with(QUICK_FLAGS):
+        yield tmp_path / "cache" / "solvers"
+
+
+@pytest.fixture
+def as_shipped(cache: Path) -> Iterator[None]:
+    """Compiled with the flags that users have."""
+    with compiled_with(SHIPPED_FLAGS):
+        yield
 
 
 def temporary(tmp_path: Path) -> Path:
@@ -53,6 +65,7 @@ def pendulum() -> MPC:
 
 @needs_clang
 @pytest.mark.slow
+@pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("mpc", [pendulum(), tiny()])
 def test_clang_gives_what_gcc_gives(
     mpc: MPC, cache: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
@@ -69,6 +82,7 @@ def test_clang_gives_what_gcc_gives(
 
 
 @needs_clang
+@pytest.mark.usefixtures("as_shipped")
 def test_clang_compiles_without_an_error_of_its_own(tmp_path: Path) -> None:
     flags = build.flags_of("clang")
     assert "-O3" in flags

@@ -8,17 +8,9 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from mpc_problems import (
-    CARTPOLE,
-    LINEAR,
-    PENDULUM,
-    projected_gradient,
-    random_linear,
-    random_states,
-    random_theta,
-    simulated,
-)
+from mpc_problems import projected_gradient, random_linear, random_states, random_theta, simulated
 from scipy.optimize import minimize
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs import ENV_IDS

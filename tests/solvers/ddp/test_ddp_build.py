@@ -6,11 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from compiling import STATE, compiler_script, libraries, tiny
+from compiling import QUICK_FLAGS, STATE, compiled_with, compiler_script, libraries, tiny
 from mpc_problems import random_linear
 
 from mpcoffline.mpc import Model, NetworkCost
@@ -21,10 +22,11 @@ from mpcoffline.solvers.ddp.codegen import source
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of compiled solvers in an empty cache."""
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of compiled solvers in an empty cache; as none is used for long, they are not optimised."""
     monkeypatch.setenv("MPCOFFLINE_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "solvers"
+    with compiled_with(QUICK_FLAGS):
+        yield tmp_path / "cache" / "solvers"
 
 
 def test_a_solver_is_compiled_once(cache: Path) -> None:
@@ -147,9 +149,10 @@ def test_a_read_only_cache(cache: Path, caplog: pytest.LogCaptureFixture) -> Non
 
 
 SCRIPT = """
-from compiling import STATE, tiny
+from compiling import QUICK_FLAGS, STATE, compiled_with, tiny
 from mpcoffline.solvers import DDPSolver
-print(repr(float(DDPSolver(tiny()).value(STATE)[0])))
+with compiled_with(QUICK_FLAGS):
+    print(repr(float(DDPSolver(tiny()).value(STATE)[0])))
 """
 
 
@@ -157,7 +160,7 @@ def child(tmp_path: Path, **environment: str) -> subprocess.Popen[str]:
     """A process that builds and uses the solver."""
     script = tmp_path / "child.py"
     script.write_text(SCRIPT)
-    helpers = Path(__file__).parent.parent / "helpers"
+    helpers = Path(__file__).parents[2] / "helpers"
     env = os.environ | {"PYTHONPATH": str(helpers)} | environment
     return subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True)
 
@@ -241,7 +244,7 @@ def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
     code, program = tmp_path / "driver.c", tmp_path / "driver"
     theta = ", ".join(repr(float(v)) for v in mpc.theta)
     code.write_text(source(mpc) + DRIVER.replace("THETA", theta))
-    flags = ["-std=gnu11", "-O1", "-g", "-march=native", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    flags = ["-std=gnu11", "-O0", "-g", "-march=native", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     built = subprocess.run(
         [compiler, *flags, str(code), "-o", str(program), "-lm"], capture_output=True, text=True, check=False
     )

@@ -9,7 +9,8 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 import pytest
-from mpc_problems import CARTPOLE, PENDULUM, projected_gradient, random_linear, random_states, simulated
+from mpc_problems import projected_gradient, random_linear, random_states, simulated
+from task_ids import CARTPOLE, PENDULUM
 
 from mpcoffline.mpc import MPC, Block, NetworkCost, ParameterSpace
 from mpcoffline.mpc.component import Component

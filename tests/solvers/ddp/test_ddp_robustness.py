@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from mpc_problems import projected_gradient, random_linear, random_states, random_theta, residual_and_cost
 from scipy.linalg import solve_discrete_are
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs import ENV_IDS
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import DDPSolver, IpoptSolver, Plan, Solution
-
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 
 
 def honest(mpc: MPC, x: np.ndarray, solution: Solution, theta: np.ndarray | None = None) -> None:

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from riccati import optimum
 from scipy.optimize import minimize
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.envs import ENV_IDS
@@ -21,7 +22,6 @@ from mpcoffline.solvers import IpoptSolver, Plan, Solution
 from mpcoffline.solvers.linear_quadratic import is_convex
 
 Array = NDArray[np.float64]
-LINEAR, PENDULUM, CARTPOLE = ENV_IDS
 
 
 @cache

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpcoffline.datasets.checks import check_numbers
+from mpcoffline.datasets.table.numbers import check_numbers
 
 from .stage_cost import PlantInfo
 

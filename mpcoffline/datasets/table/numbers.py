@@ -148,15 +148,15 @@ def check_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
     return array
 
 
-def check_sizes(name: str, sizes: Mapping[str, tuple[int, int]]) -> None:
-    """Refuses numbers of coordinates that are not those of the MPC: found and wanted, by what they count."""
+def check_sizes(name: str, sizes: Mapping[str, tuple[int, int]], other: str = "the MPC") -> None:
+    """Refuses numbers of coordinates that are not those of the other: found and wanted, by what they count."""
     for kind, (found, wanted) in sizes.items():
         if found != wanted:
             raise InvalidDataError(
                 f"{name}: {kind}",
-                expected=f"{wanted} coordinates, as in the MPC",
+                expected=f"{wanted} coordinates, as in {other}",
                 actual=str(found),
-                hint="Is this data set of the same task as the MPC?",
+                hint=f"Is this data set of the same task as {other}?",
             )
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, StorageError
-from mpcoffline.datasets.store.local import dataset_path, is_local, recording_of
+from mpcoffline.datasets.store.ids import dataset_path, is_local
 from mpcoffline.datasets.store.opening import read_metadata
-from mpcoffline.datasets.store.recording_lock import log_files
+from mpcoffline.datasets.store.recording_lock import kept_path, log_files
+from mpcoffline.datasets.store.writing import recording_of
 
-from .episode_log import LogIndex
-from .log_records import LogHeader
+from .episode_log import LogIndex, scan
+from .log_format import LogHeader
 
 
 def common_header(indices: list[LogIndex]) -> LogHeader:
@@ -107,9 +109,7 @@ def _plants(first: str | None, second: str | None) -> tuple[str | None, str | No
 
 def set_aside(dataset_id: str) -> Path:
     """Moves the logs to where nobody continues them; moved back, they can be repaired."""
-    number = 0
-    while (kept := dataset_path("") / ".broken" / f"{dataset_id}-recording-{number}").exists():
-        number += 1
+    kept = kept_path(dataset_id, "-recording")
     try:
         kept.mkdir(parents=True)
         for path in log_files(dataset_id):
@@ -117,6 +117,18 @@ def set_aside(dataset_id: str) -> Path:
     except OSError as error:
         raise StorageError.of(kept, error) from error
     return kept
+
+
+def sealed_recordings() -> list[str]:
+    """Ids of recordings whose logs are in their data set: the process was killed before it had removed them."""
+    root, found = dataset_path("") / ".recording", []
+    for folder in sorted({path.parent for path in root.rglob("env-*.log")} if root.is_dir() else ()):
+        name = folder.relative_to(root).as_posix()
+        sealed = recording_of(name)
+        with suppress(FileFormatError, OSError):
+            if sealed is not None and common_header([scan(path) for path in log_files(name)]).recording == sealed:
+                found.append(name)
+    return found
 
 
 def remove_logs(dataset_id: str) -> None:

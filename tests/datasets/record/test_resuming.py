@@ -22,7 +22,7 @@ import mpcoffline.envs  # noqa: F401
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets import MinariRecorder, dataset_from_arrays, record, repair
 from mpcoffline.datasets.recipes import Recipe
-from mpcoffline.datasets.store.recording_lock import RecordingLock, log_files
+from mpcoffline.datasets.store.recording_lock import RecordingLock, kept_path, log_files
 from mpcoffline.gallery.collection import collect_with
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
@@ -87,6 +87,15 @@ def test_another_recording_starts_anew_and_loses_nothing(what: str, change: dict
     kept = Path(str(told[0].message).split("kept in ")[1][:-1])
     assert (kept / interrupted.name).read_bytes() == content
     assert not log_files(CUT)
+
+
+def test_what_has_the_longest_name_is_kept_too(store: Path) -> None:
+    names = []
+    for _ in range(12):
+        names.append(kept_path("a" * 252 + "-v0", "-recording"))
+        names[-1].mkdir(parents=True)
+    assert len(set(names)) == 12
+    assert {path.parent for path in names} == {store / ".broken"}
 
 
 def test_declining_to_resume_deletes_what_there_is(interrupted: Path, store: Path) -> None:

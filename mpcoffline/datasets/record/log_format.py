@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError
-from mpcoffline.datasets.checks import NUMBERS, check_numbers
+from mpcoffline.datasets.table.numbers import NUMBERS, check_numbers
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
@@ -122,7 +122,7 @@ def cut_off(episode: LoggedEpisode) -> LoggedEpisode:
     return replace(episode, complete=False, arrays=episode.arrays | {"truncations": truncations})
 
 
-def record(kind: int, content: bytes, offset: int) -> bytes:
+def framed(kind: int, content: bytes, offset: int) -> bytes:
     """The bytes of a record that begins at ``offset``."""
     frame = FRAME.pack(MARKER, kind, len(content), zlib.crc32(content))
     return frame + CRC.pack(_frame_crc(frame, offset)) + content

@@ -1,0 +1,53 @@
+"""The method "bellman": the published regressions, begun at an identified model and ended by a terminal cost from V."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.learning.method import METHODS, Method
+from mpcoffline.learning.stages import Stage
+from mpcoffline.learning.value.config import ValueConfig
+
+from .regression import ParameterConfig
+from .stages import FitTerminal, Identify, LearnParameters, LearnValue, StartConfig, TerminalConfig
+
+
+@METHODS.register("bellman")
+@dataclass(frozen=True)
+class Bellman(Method):
+    """The regressions of arXiv:2301.01667 one after the other; no MPC is solved.
+
+    In this order: identification of the model and removal of measurement noise (``init="identified"``), V_phi by
+    (VALUE), theta by (FIT), the terminal cost from V. By default all are as in :class:`~mpcoffline.learning.Paper`.
+
+    Attributes:
+        identify: Where the model starts.
+        value: How V_phi is learned.
+        fit: How theta is learned.
+        terminal: What the terminal cost becomes.
+    """
+
+    identify: StartConfig = field(default_factory=StartConfig)
+    value: ValueConfig = field(default_factory=ValueConfig)
+    fit: ParameterConfig = field(default_factory=ParameterConfig)
+    terminal: TerminalConfig = field(default_factory=TerminalConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.fit.potential and self.terminal.method in ("given", "norm"):
+            raise InvalidArgumentError(
+                "potential",
+                expected="a terminal cost from V, as T = V - Phi",
+                actual=f"terminal={self.terminal.method!r}",
+                hint="Set terminal='network' or 'quadratic'.",
+            )
+
+    def stages(self) -> dict[str, Stage]:
+        """Identification, (VALUE), (FIT), the terminal cost."""
+        return {
+            "identify": Identify(self.identify),
+            "value": LearnValue(self.value),
+            "fit": LearnParameters(self.fit, self.identify.adapt_above),
+            "terminal": FitTerminal(self.terminal),
+        }

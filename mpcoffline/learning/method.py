@@ -1,0 +1,155 @@
+"""Learning methods: their options, by stage, and the door through which others add theirs."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from mpcoffline.core.checks import check_integers, check_number
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.registry import Registry
+from mpcoffline.mpc import MPC, QuadraticCost
+
+from .stages import Stage
+from .value.methods import ValueMethod, method_to_json
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """How an MPC is learned: everything that a fit depends on besides data and seed, and the stages that do it.
+
+    A subclass is a frozen dataclass, of which an instance without arguments exists. Its fields that are dataclasses
+    themselves are the options of the stage of that name.
+
+    Example:
+        >>> @METHODS.register("mine")
+        ... @dataclass(frozen=True)
+        ... class Mine(Method):
+        ...     fit: MyConfig = field(default_factory=MyConfig)
+        ...
+        ...     def stages(self):
+        ...         return {"fit": MyStage(self.fit)}
+        >>> OfflineMPCLearner(mpc, method="mine")
+
+    Attributes:
+        trim: Share of the transitions that is learned from; the farthest out are left out.
+        discount: gamma of V and of the learned MPC; None keeps the given MPC's.
+        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken.
+        horizon: N of the learned MPC; None keeps the given one's.
+        cross_term: Whether the quadratic stage cost gets a cross term S.
+    """
+
+    trim: float = 0.9
+    discount: float | None = None
+    least_discount: float = 0.0
+    horizon: int | None = None
+    cross_term: bool = False
+
+    def __post_init__(self) -> None:
+        check_number("trim", self.trim, 0.0, 1.0)
+        if self.discount is not None:
+            check_number("discount", self.discount, 0.0, 1.0)
+        check_number("least_discount", self.least_discount, 0.0, 1.0, open_low=False)
+        if self.horizon is not None:
+            check_integers(1, horizon=self.horizon)
+
+    @abstractmethod
+    def stages(self) -> dict[str, Stage]:
+        """New stages by name, in their order."""
+
+    @property
+    def name(self) -> str:
+        """What it is called in calls and files.
+
+        Raises:
+            InvalidArgumentError: If it is not registered.
+        """
+        name = next((name for name, method in METHODS.items() if method is type(self)), None)
+        if name is None:
+            hint = "Register it: METHODS.register(name) before the class."
+            raise InvalidArgumentError("learning method", expected="one with a name", actual=repr(self), hint=hint)
+        return name
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """All options by the names that :meth:`replaced` takes."""
+        return {
+            name: getattr(getattr(self, stage) if stage else self, field)
+            for name, (stage, field) in self._homes().items()
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as a file has them, for :meth:`replaced`.
+
+        Raises:
+            InvalidArgumentError: For a value method of one's own that no file can hold.
+        """
+        return {
+            name: method_to_json(value) if isinstance(value, ValueMethod) else value
+            for name, value in self.options.items()
+        }
+
+    def replaced(self, options: Mapping[str, Any]) -> Self:
+        """The method with options replaced by name, of which each has one.
+
+        A stage's ``method`` goes by the name of the stage (``value="td"``), a field that two stages have by that of
+        stage and field (``fit_n_steps=300``), any other by its own (``tau=0.1``).
+
+        Args:
+            options: Values by name, e.g. ``{"trim": 1.0, "tau": 0.1}``.
+
+        Raises:
+            UnknownIdError: For a name that is none of these.
+            InvalidArgumentError: For a value out of range.
+        """
+        homes = self._homes()
+        changes: dict[str, dict[str, Any]] = {stage: {} for stage, _ in homes.values()}
+        for given, value in options.items():
+            if given not in homes:
+                raise UnknownIdError.of(f"option of the learning method {type(self).__name__}", given, homes)
+            stage, field = homes[given]
+            plain = value.item() if isinstance(value, np.generic) else value  # JSON has neither numpy nor tuples
+            changes[stage][field] = tuple(plain) if isinstance(plain, list) else plain
+        own = changes.pop("", {})
+        return replace(self, **own, **{stage: replace(getattr(self, stage), **part) for stage, part in changes.items()})
+
+    def _homes(self) -> dict[str, tuple[str, str]]:
+        """Stage (``""`` for none) and field of each option."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        found = [("", name) for name, part in parts.items() if not is_dataclass(part)]
+        found += [(stage, field.name) for stage, part in parts.items() if is_dataclass(part) for field in fields(part)]
+        shared = Counter(field for _, field in found)
+
+        def spelled(stage: str, field: str) -> str:
+            if stage and field == "method":
+                return stage
+            return f"{stage}_{field}" if stage and shared[field] > 1 else field
+
+        return {spelled(stage, field): (stage, field) for stage, field in found}
+
+    def restructured(self, nominal: MPC) -> MPC:
+        """The MPC with the discount, the horizon and the form of stage cost that the options ask for."""
+        discount = max(nominal.discount, self.least_discount) if self.discount is None else self.discount
+        horizon = nominal.horizon if self.horizon is None else self.horizon
+        mpc = nominal.replace(discount=discount, horizon=horizon)
+        cost = nominal.stage_cost
+        if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
+            values, cross = cost.values, np.zeros((cost.nx, cost.nu))
+            constant = float(values["constant"])
+            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
+            return mpc.replace(stage_cost=crossed)
+        if self.cross_term:
+            _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")
+        return mpc
+
+
+#: Add a method of your own by ``@METHODS.register("name")`` before its class; files name it.
+METHODS: Registry[type[Method]] = Registry("learning method", Method)
