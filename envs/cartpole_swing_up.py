@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rendering as style
+from .arguments import Array
 from .base import ControlTask
-from .plant import Array, Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
 from .registry import register
 from .rendering import Canvas, Moment, clockwise, refined, signed
 

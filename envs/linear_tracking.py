@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rendering as style
-from .arguments import checked_number
+from .arguments import Array, checked_number
 from .base import ControlTask
-from .plant import Array, Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
 from .registry import register
 from .rendering import Canvas, Moment, refined, signed
 

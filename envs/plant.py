@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from .arguments import Array
+
 Entries = Sequence[Any]
 Values = Mapping[str, Any]
 #: Draws an initial state ``(nx,)``.

@@ -15,10 +15,11 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import ArrayLike, NDArray
 
+from .arguments import Array
+
 if TYPE_CHECKING:
     import pygame
 
-Array = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 Color = tuple[int, int, int]
 

@@ -24,6 +24,7 @@ from rich.segment import Segment
 from typer.core import TyperGroup
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError, visible
+from mpcoffline.core.outputs import check_output
 from mpcoffline.envs import PLANTS, ControlTask
 
 from .others import AddedCommand, added_commands
@@ -235,15 +236,6 @@ def check_figure(option: str, path: Path) -> None:
 
 def check_out(option: str, path: Path, *, make: bool = False) -> None:
     """Refuses a file that could not be written: before the work, not after it. ``make`` if its folder will be made."""
-    from mpcoffline.core.outputs import check_output
-
     if not make and not path.parent.is_dir():
         raise InvalidArgumentError(option, expected="a file in a folder that exists", actual=str(path))
     check_output(path, make=make)
-
-
-def check_out_folder(path: Path, *names: str) -> None:
-    """Refuses a folder in which these files could not be written: before the work, not after it."""
-    from mpcoffline.core.outputs import check_output_folder
-
-    check_output_folder(path, names)

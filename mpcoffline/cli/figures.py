@@ -10,13 +10,13 @@ import typer
 from rich.markup import escape
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.outputs import check_output_folder
 
 from .common import (
     Json,
     LearnerFile,
     PlantAlpha,
     check_out,
-    check_out_folder,
     examples,
     loaded_learner,
     made_environment,
@@ -105,7 +105,7 @@ def plot(
     import mpcoffline
     from mpcoffline import MPCPolicy, plotting
 
-    check_out_folder(out, *(f"{stem}.{suffix}" for stem in _FIGURES for suffix in ("pdf", "png")))
+    check_output_folder(out, tuple(f"{stem}.{suffix}" for stem in _FIGURES for suffix in ("pdf", "png")))
     fitted = loaded_learner(learner)
     task = made_environment(env or _task_of(fitted), alpha, None)
     if film is not None:

@@ -11,6 +11,7 @@ import typer
 from rich.markup import escape
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.outputs import check_output_folder
 from mpcoffline.core.tables import Table
 
 from .common import (
@@ -24,7 +25,6 @@ from .common import (
     Task,
     Value,
     check_out,
-    check_out_folder,
     console,
     examples,
     loaded_policy,
@@ -107,7 +107,7 @@ def learn(
         if path is not None:
             check_out(option, path)
     if tensorboard is not None:
-        check_out_folder(tensorboard)
+        check_output_folder(tensorboard)
     data, mpc = _data_and_mpc(task, dataset, alpha, seed)
     overrides: dict[str, Any] = {"discount": discount, "horizon": horizon}
     learner = OfflineMPCLearner(

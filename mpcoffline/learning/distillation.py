@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mpcoffline.core.types import Array
 from mpcoffline.mpc.networks import random_layers
 
-Array = NDArray[np.float64]
 Layers = list[tuple[Tensor, Tensor]]
 
 _DAMPING = (1e-2, 1e-7, 1e8)  # at first, least, most

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.core import limits
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.limits import check_limit
-
-Array = NDArray[np.float64]
 
 
 class Potential:

@@ -19,12 +19,12 @@ from torch import Tensor
 
 from mpcoffline.core.checks import check_integers, check_known, check_number
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import NetworkCost, QuadraticCost, TerminalCost
 from mpcoffline.mpc.networks import HIDDEN
 
 from .distillation import fit_network
 
-Array = NDArray[np.float64]
 StateFunction = Callable[[Tensor], Tensor]
 TerminalKind = Literal["quadratic", "network"]
 

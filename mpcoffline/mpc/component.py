@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.registry import Registry
+from mpcoffline.core.types import Array
 
-from .parameters import Array, Block, Parameter, ParameterSpace
+from .parameters import Block, Parameter, ParameterSpace
 
 
 class Component:

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.registry import Registry
 from mpcoffline.core.text import check_name
+from mpcoffline.core.types import Array
 
 from .expressions import function_from_json, function_to_json, traced
-from .parameters import Array, ParameterSpace
+from .parameters import ParameterSpace
 
 ConstraintFunction = Callable[..., ca.SX]  # (x, u, p) -> h; (x, p) -> h at the end of the horizon
 

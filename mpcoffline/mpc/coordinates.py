@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-
-Array = NDArray[np.float64]
 
 _OFF_SADDLE = 0.1  # in scaled coordinates
 _AT_BOUND = 1e-6  # likewise

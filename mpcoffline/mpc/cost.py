@@ -11,9 +11,10 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 
 from .component import COSTS, Component, blocks_from_json, difference, numbers, vector
-from .parameters import Array, Block, ParameterSpace
+from .parameters import Block, ParameterSpace
 
 
 @COSTS.register("QuadraticCost")

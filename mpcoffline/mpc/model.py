@@ -13,10 +13,11 @@ from mpcoffline.core import limits
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
+from mpcoffline.core.types import Array
 
 from .component import Component, blocks_from_json
 from .expressions import function_from_json, function_to_json, traced
-from .parameters import Array, Block, Parameter, ParameterSpace
+from .parameters import Block, Parameter, ParameterSpace
 
 Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
 

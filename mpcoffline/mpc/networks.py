@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 
 from .component import COSTS, Component, blocks_from_json, difference, vector
 from .cost import QuadraticCost
-from .parameters import Array, Block, Parameter, ParameterSpace
+from .parameters import Block, Parameter, ParameterSpace
 
 HIDDEN = (24, 24)  # widths that hold the value of a swing-up to a few percent
 _SMALL = 1e-3  # curvature that a convex network cost has by default besides the network's

@@ -19,8 +19,8 @@ from mpcoffline.core import limits
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.text import LONGEST, check_name, check_unit
+from mpcoffline.core.types import Array
 
-Array = NDArray[np.float64]
 Kind = Literal["free", "psd"]
 Group = Literal["model", "cost", "terminal", "reference"]
 

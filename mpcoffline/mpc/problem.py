@@ -16,6 +16,7 @@ from mpcoffline.core import limits
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
+from mpcoffline.core.types import Array
 
 from .component import StageCost, TerminalCost, cost_from_json
 from .constraints import (
@@ -30,7 +31,7 @@ from .constraints import (
 from .expression_cost import cost_to_json
 from .expressions import traced
 from .model import Model
-from .parameters import Array, Group, ParameterSpace
+from .parameters import Group, ParameterSpace
 
 
 @dataclass(frozen=True, eq=False)

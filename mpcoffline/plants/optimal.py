@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from mpcoffline.core.types import Array
 from mpcoffline.envs import Plant
 from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.mpc import MPC, QuadraticCost
 
 from .nominal import nominal_mpc
-
-Array = NDArray[np.float64]
 
 
 def riccati(plant: Plant, A: Array, B: Array) -> Array:

@@ -20,9 +20,8 @@ from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.archive import read_archive
 from mpcoffline.core.checks import check_integers, checked_seed
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.outputs import make_folder
 from mpcoffline.datasets.record.plants import check_spaces, made, opened
 from mpcoffline.learner.learner import OfflineMPCLearner
@@ -205,20 +204,12 @@ class MPCModel(BaseAlgorithm):
         if print_system_info:
             get_system_info()
         file = Path(path)
-        return cls(_read_policy(file if file.exists() else _with_suffix(file)), env, verbose=verbose, seed=seed)
+        policy = MPCPolicy.load(file if file.exists() else _with_suffix(file))
+        return cls(policy, env, verbose=verbose, seed=seed)
 
 
 def _with_suffix(path: Path) -> Path:
     return path if path.suffix else path.with_name(f"{path.name}.zip")
-
-
-def _read_policy(path: Path) -> MPCPolicy:
-    """The policy of a policy's or a learner's file."""
-    try:
-        read_archive(path, "learner")
-    except FileFormatError:
-        return MPCPolicy.load(path)
-    return OfflineMPCLearner.load(path).policy
 
 
 def _given(env: gym.Env[Any, Any] | VecEnv | str, verbose: int) -> gym.Env[Any, Any] | VecEnv:

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
-from .interface import Array, Plan, Solution, Solver
+from .interface import Plan, Solution, Solver
 from .ipopt.solver import IpoptSolver
 
 logger = logging.getLogger(__name__)

@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.registry import Registry
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
 from .status import Stats, Status
-
-Array = NDArray[np.float64]
 
 _FLOAT32 = float(np.finfo(np.float32).eps)
 

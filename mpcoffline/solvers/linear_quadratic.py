@@ -13,9 +13,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, StageCost, TerminalCost
-
-from .interface import Array
 
 _TOUCHING = 1e-9  # distance from a bound that counts as none, relative to 1 + |u|
 _SINGULAR = 1e-13  # of a Hessian's diagonal, below which a pivot counts as zero

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
-from .interface import SOLVERS, Array, OneAtATime, Plan, Solution, Solver
+from .interface import SOLVERS, OneAtATime, Plan, Solution, Solver
 from .ipopt.solver import IpoptSolver
 from .linear_quadratic import Extraction, LinearQuadratic, Riccati, misfit
 from .status import Stats, Status

@@ -183,7 +183,7 @@ def test_other_files_are_refused(tmp_path: Path, file: Path) -> None:
     with pytest.raises(FileFormatError, match=r"cut\.zip: expected an mpcoffline policy file"):
         MPCModel.load(tmp_path / "cut")
     OfflineMPCLearner(lq_plant.make_mpc()).save(tmp_path / "unfitted.zip")
-    with pytest.raises(MPCOfflineError, match="expected a fitted learner"):
+    with pytest.raises(MPCOfflineError, match="expected a learner that has learned"):
         MPCModel.load(tmp_path / "unfitted")
 
 

@@ -16,9 +16,9 @@ import pytest
 from mpc_problems import random_linear
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.solvers import Solver, make_solver
-from mpcoffline.solvers.interface import Array
 
 THREADS = 8
 

@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
-
-Array = NDArray[np.float64]
+from mpcoffline.core.types import Array
 
 
 def number_of(value: object) -> float | None:

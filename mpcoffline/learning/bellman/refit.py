@@ -8,18 +8,16 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.learning.potential import Potential
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 
 from .equation import BellmanProblem
-
-Array = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning.stages import FitResult, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
@@ -20,8 +21,6 @@ from mpcoffline.mpc.coordinates import Coordinates, canonical
 
 from .equation import BellmanProblem, PredictionError, variance_of
 from .refit import refit_cost
-
-Array = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures
-
-Array = NDArray[np.float64]
 
 # On the logs that ship, with noise added, the low expectile of samples came closer to V* than implicit Q-learning up to
 # half noise in s+ - s: V is smooth, and its targets are held in bounds. Noise in L goes into the target as it is.

@@ -10,8 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Array, Plan
+from mpcoffline.solvers.interface import Plan
 from mpcoffline.solvers.starts import candidate_inputs
 from mpcoffline.solvers.status import Status
 

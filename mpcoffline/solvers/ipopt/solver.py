@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import SOLVERS, Array, OneAtATime, Plan, Solution, Solver
+from mpcoffline.solvers.interface import SOLVERS, OneAtATime, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
 from mpcoffline.solvers.starts import N_CANDIDATES

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Penalty
-from mpcoffline.solvers.interface import Array
 from mpcoffline.solvers.starts import N_CANDIDATES
 
 

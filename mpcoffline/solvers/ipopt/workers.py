@@ -8,8 +8,9 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from mpcoffline.core.parallel import EXECUTORS, Executor, n_cpus
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Array, Plan
+from mpcoffline.solvers.interface import Plan
 
 from .program import Found, Programs
 
