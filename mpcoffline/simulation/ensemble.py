@@ -10,7 +10,7 @@ import torch
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import Identification, OneStepProblem, Transitions, without_jumps
+from mpcoffline.estimation.identification import Identification, OneStepProblem, Rows, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
@@ -102,19 +102,19 @@ class _Episodes:
         if len(ids) < _FEW_EPISODES:
             self._first, self._length = np.arange(len(table)), np.ones(len(table), dtype=np.int64)
 
-    def resampled(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
+    def resampled(self, rows: Rows, rng: np.random.Generator) -> Rows:
         """As many rows as there are, or some thousand."""
         wanted = min(self._n_rows, _BOOTSTRAP_ROWS)
         drawn = rng.integers(len(self._first), size=1 + int(2 * wanted / self._length.mean()))
         pieces = [np.arange(self._first[k], self._first[k] + self._length[k]) for k in drawn]
         chosen = np.concatenate(pieces)[:wanted]
-        return Transitions(*(part[chosen] for part in rows))
+        return Rows(*(part[chosen] for part in rows))
 
 
 def _problem_of(mpc: MPC, table: TransitionTable, identification: Identification) -> OneStepProblem:
     """One-step prediction on the whole table, wrapped angles without jumps."""
     columns = table.values()
-    rows = Transitions(columns.observations, columns.actions, columns.next_observations)
+    rows = Rows(columns.observations, columns.actions, columns.next_observations)
     centre = table.centring.centre[: table.ny]
     problem = OneStepProblem(mpc, rows, centre)
     if not identification.unwrapped:

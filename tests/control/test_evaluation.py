@@ -53,7 +53,7 @@ def looped(env_id: str, policy: Linear, seed: int, discount: float, **options: A
     states = [info["state"]]
     for k in range(1_000):
         action = policy.predict(observation[None], episode_start=[k == 0])[0][0]
-        cost = float(plant.cost(states[-1], action.astype(np.float64)))
+        cost = float(plant.cost(states[-1], plant.checked_action(action, action.shape)))
         observation, _, terminated, truncated, info = env.step(action)
         states.append(info["state"])
         total, discounted = total + cost, discounted + discount**k * cost

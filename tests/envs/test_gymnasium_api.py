@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 from task_ids import CARTPOLE, LINEAR, PENDULUM
 
-from mpcoffline.envs import ENV_IDS, ControlTask
+from mpcoffline.envs import ENV_IDS, ControlTask, plant_of
 
 A = [[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.8, 0.0], [0.0, 0.0, 0.0, 0.8]]
 
@@ -25,19 +25,20 @@ PLANTS: dict[str, dict[str, Any]] = {
     PENDULUM: {"m": 1.3, "l": 0.7, "g": 3.7},
     CARTPOLE: {"m_c": 0.3, "m_p": 0.1, "l": 0.4, "mu": 0.2, "g": 3.7},
 }
-NX = {LINEAR: 4, PENDULUM: 2, CARTPOLE: 4}
 
 
 def cases() -> list[Any]:
     """All tasks with each argument alone, and with all together."""
     found = [pytest.param(LINEAR, {"alpha": 0.5}, id="LinearTracking-alpha")]
     for env_id in ENV_IDS:
+        plant = plant_of(env_id)
+        assert plant is not None
         each = {
             "defaults": {},
-            "plant": PLANTS[env_id],
+            "plant": PLANTS.get(env_id) or {p.name: 1.1 * float(p.value) for p in plant.parameters},
             "start": {"start": [-0.5, 0.5]},
             "process noise": {"process_noise": 0.05},
-            "measurement noise": {"measurement_noise": [0.01 * (i + 1) for i in range(NX[env_id])]},
+            "measurement noise": {"measurement_noise": [0.01 * (i + 1) for i in range(len(plant.states))]},
         }
         each["all"] = {key: value for one in each.values() for key, value in one.items()}
         name = env_id.split("/")[1].split("-")[0]

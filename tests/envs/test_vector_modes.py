@@ -182,7 +182,7 @@ def test_pictures_of_all_copies() -> None:
 
 
 def test_frames_a_second_follow_the_task() -> None:
-    assert [twin_of(env_id, 1).metadata["render_fps"] for env_id in ENV_IDS] == [10, 20, 20]
+    assert [twin_of(env_id, 1).metadata["render_fps"] for env_id in ENV_IDS[:3]] == [10, 20, 20]
 
 
 @pytest.mark.parametrize(

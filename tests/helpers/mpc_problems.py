@@ -7,8 +7,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from task_ids import LINEAR, PENDULUM
+from task_ids import CARTPOLE, LINEAR, PENDULUM
 
+from mpcoffline.envs import PLANTS
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.solvers import Solution
 
@@ -20,6 +21,10 @@ def random_states(env_id: str, n: int, seed: int = 0, speed: float = 3.0) -> Arr
     rng = np.random.default_rng(seed)
     if env_id == LINEAR:
         return rng.uniform(-1, 1, size=(n, 4))
+    if env_id not in (PENDULUM, CARTPOLE):
+        plant = next(plant for plant in PLANTS.values() if plant.id == env_id)
+        draw = next(iter(plant.starts.values()))
+        return np.array([plant.lift(draw(rng), np.cos, np.sin) for _ in range(n)])
     angle, rate = rng.uniform(-np.pi, np.pi, n), rng.uniform(-speed, speed, n)
     y = np.stack([np.cos(angle), np.sin(angle), rate], axis=1)
     return y if env_id == PENDULUM else np.hstack([rng.uniform(-1, 1, size=(n, 2)), y])
