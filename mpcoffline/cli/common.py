@@ -73,10 +73,8 @@ class Start(StrEnum):
 
 def _checked_value(given: str | None) -> str | None:
     """Refuses what is no method of (VALUE); torch is imported where there is one to look at."""
-    if given is not None:
-        from mpcoffline.core.checks import check_known
-
-        check_known("--value", given, _value_methods())
+    if given is not None and given not in (known := _value_methods()):
+        raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}.")
     return given
 
 
