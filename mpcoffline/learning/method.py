@@ -102,7 +102,9 @@ class Method(ABC):
         changes: dict[str, dict[str, Any]] = {stage: {} for stage, _ in homes.values()}
         for given, value in options.items():
             if given not in homes:
-                raise UnknownIdError.of(f"option of the learning method {type(self).__name__}", given, homes)
+                where = " or ".join(repr(name) for name, other in METHODS.items() if given in other()._homes())
+                hint = f"The learning method {where} has it." if where else ""
+                raise UnknownIdError.of(f"option of the learning method {type(self).__name__}", given, homes, hint)
             stage, field = homes[given]
             changes[stage][field] = value.item() if isinstance(value, np.generic) else value  # JSON has no numpy
         own = changes.pop("", {})
