@@ -16,7 +16,7 @@ from mpcoffline.core.checks import check_integers, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.check.rebuilding import rebuilt_spec, without_window
-from mpcoffline.datasets.record.plants import (
+from mpcoffline.datasets.recording.plants import (
     check_spaces,
     check_unchanged,
     check_units,
@@ -26,8 +26,8 @@ from mpcoffline.datasets.record.plants import (
     opened,
     step_cap,
 )
-from mpcoffline.datasets.record.stage_cost import PlantInfo, number_of, reward_of
-from mpcoffline.datasets.record.watching import PlantWatch, watched
+from mpcoffline.datasets.recording.stage_cost import PlantInfo, number_of, reward_of
+from mpcoffline.datasets.recording.watching import PlantWatch, watched
 from mpcoffline.envs import ControlTask
 from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.solvers.fallback import SolverStats, failures_in_words

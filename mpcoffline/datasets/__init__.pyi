@@ -14,10 +14,10 @@ from .interop.convert import to_d3rlpy as to_d3rlpy
 from .interop.convert import to_dict as to_dict
 from .interop.convert import to_sb3_replay_buffer as to_sb3_replay_buffer
 from .interop.convert import to_torchrl as to_torchrl
-from .record.from_arrays import dataset_from_arrays as dataset_from_arrays
-from .record.from_csv import from_csv as from_csv
-from .record.recorder import MinariRecorder as MinariRecorder
-from .record.rollouts import record as record
+from .recording.from_arrays import dataset_from_arrays as dataset_from_arrays
+from .recording.from_csv import from_csv as from_csv
+from .recording.recorder import MinariRecorder as MinariRecorder
+from .recording.rollouts import record as record
 from .store.local import list_datasets as list_datasets
 from .store.verification import VerifyReport as VerifyReport
 from .store.verification import verify as verify

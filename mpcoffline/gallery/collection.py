@@ -21,7 +21,7 @@ import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.progress import Bars
 from mpcoffline.datasets.recipes import Recipe
-from mpcoffline.datasets.record.recorder import MinariRecorder
+from mpcoffline.datasets.recording.recorder import MinariRecorder
 from mpcoffline.envs import ControlTask
 from mpcoffline.envs.episode import DISCOUNT, EPISODE_STEPS
 

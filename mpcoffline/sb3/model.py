@@ -23,7 +23,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.outputs import make_folder
-from mpcoffline.datasets.record.plants import check_spaces, made, opened
+from mpcoffline.datasets.recording.plants import check_spaces, made, opened
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.solvers import Plan
 

@@ -17,7 +17,7 @@ from minari.data_collector import EpisodeBuffer
 
 from mpcoffline.core.errors import UnknownIdError
 from mpcoffline.datasets import repair
-from mpcoffline.datasets.record.recording import Recording
+from mpcoffline.datasets.recording.session import Recording
 from mpcoffline.datasets.store.recording_lock import log_files
 
 DATASET = "test/crash-v0"

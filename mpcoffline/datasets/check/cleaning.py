@@ -13,8 +13,8 @@ from mpcoffline.core.caches import KINDS, disk_size, entries, remove
 from mpcoffline.core.errors import MPCOfflineError, UnknownIdError
 from mpcoffline.core.places import cache_root, temporary_root
 from mpcoffline.core.scratch import abandoned, is_free, remove_abandoned
-from mpcoffline.datasets.record.recording import seal
-from mpcoffline.datasets.record.resuming import sealed_recordings
+from mpcoffline.datasets.recording.resuming import sealed_recordings
+from mpcoffline.datasets.recording.session import seal
 from mpcoffline.datasets.store.ids import BACKUPS, DOWNLOADS, dataset_path
 from mpcoffline.datasets.store.manifest import MANIFEST
 from mpcoffline.datasets.store.recording_lock import empty_recordings, recording_path, remove_empty

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import HumanRendering
 
-from mpcoffline.datasets.record.watching import wrappers_around
+from mpcoffline.datasets.recording.watching import wrappers_around
 
 Env = gym.Env[Any, Any]
 

@@ -22,7 +22,7 @@ from mpcoffline.core.files import check_regular, read_limited
 from mpcoffline.core.limits import METADATA_BYTES
 from mpcoffline.core.scratch import scratch_folder
 from mpcoffline.core.text import visible
-from mpcoffline.datasets.record.recording import seal
+from mpcoffline.datasets.recording.session import seal
 from mpcoffline.datasets.store.hdf5_guard import check_episodes, episode_number
 from mpcoffline.datasets.store.hdf5_writing import SteadyFile, checked, write_steadily
 from mpcoffline.datasets.store.ids import backup_path, check_dataset_id, dataset_path, is_local

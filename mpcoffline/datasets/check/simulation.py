@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidDataError, MPCOfflineError
-from mpcoffline.datasets.record.stage_cost import PlantInfo, number_of
+from mpcoffline.datasets.recording.stage_cost import PlantInfo, number_of
 from mpcoffline.envs import ControlTask
 
 if TYPE_CHECKING:

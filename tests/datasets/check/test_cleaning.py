@@ -22,8 +22,8 @@ from mpcoffline.core import places
 from mpcoffline.core.errors import UnknownIdError
 from mpcoffline.datasets import clean, dataset_from_arrays, list_datasets, load_dataset
 from mpcoffline.datasets.check.cleaning import Kind
-from mpcoffline.datasets.record import recording as module_of_recording
-from mpcoffline.datasets.record.recording import Recording
+from mpcoffline.datasets.recording import session as module_of_recording
+from mpcoffline.datasets.recording.session import Recording
 from mpcoffline.datasets.store.recording_lock import RecordingLock
 
 SPACES = {"observation_space": crashing.SPACE, "action_space": crashing.ACTIONS}

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from mpcoffline.cli.main import app
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets import repair
-from mpcoffline.datasets.record.episode_log import EpisodeLog, scan
-from mpcoffline.datasets.record.log_format import LoggedEpisode, LogHeader
+from mpcoffline.datasets.recording.episode_log import EpisodeLog, scan
+from mpcoffline.datasets.recording.log_format import LoggedEpisode, LogHeader
 from mpcoffline.datasets.store.recording_lock import log_files
 
 HEADER = LogHeader("test/log-v0", "name", "new", "{}", "{}")

@@ -22,7 +22,7 @@ from pendulum_data import recorded, stored
 
 from mpcoffline.core.errors import StorageError
 from mpcoffline.datasets import dataset_from_arrays, repair
-from mpcoffline.datasets.record.recording import Recording
+from mpcoffline.datasets.recording.session import Recording
 from mpcoffline.datasets.store import hdf5_writing
 from mpcoffline.datasets.store.hdf5_writing import SteadyFile, write_steadily
 from mpcoffline.datasets.store.packed import pack, packed_size

@@ -21,7 +21,7 @@ FORBIDDEN = {
     ".recover_environment": set[str](),
     "EnvSpec.from_json": {
         "mpcoffline/datasets/store/packed.py",
-        "mpcoffline/datasets/record/recording.py",
+        "mpcoffline/datasets/recording/session.py",
         "mpcoffline/datasets/check/repairing.py",
     },
     "h5py.File": {

@@ -210,7 +210,7 @@ def test_nothing_stays_behind_and_no_random_number_is_drawn() -> None:
 
 def test_a_copy_of_a_watched_environment_is_another_environment() -> None:
     """A callback that plans on copies steps them, not the plant."""
-    from mpcoffline.datasets.record.watching import watched
+    from mpcoffline.datasets.recording.watching import watched
 
     env = Plain(Drift())
     with watched(env) as watch:

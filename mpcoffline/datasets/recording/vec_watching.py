@@ -32,7 +32,7 @@ class VecWatch:
 
     It stands below all wrappers of the ``VecEnv``; only one that makes the observations a Box in the first place
     (``VecExtractDictObs``) is looked through from above. In a ``DummyVecEnv`` the rewards are those of the plants
-    (:class:`~mpcoffline.datasets.record.watching.PlantWatch`), in float64; environments in other processes cannot be
+    (:class:`~mpcoffline.datasets.recording.watching.PlantWatch`), in float64; environments in other processes cannot be
     watched, and show what the ``VecEnv`` gives.
 
     Args:

@@ -20,7 +20,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, UnknownIdError
 from mpcoffline.datasets import record
 from mpcoffline.datasets.check.rebuilding import rebuilt_spec
-from mpcoffline.datasets.record.plants import MAX_EPISODE_STEPS
+from mpcoffline.datasets.recording.plants import MAX_EPISODE_STEPS
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.sb3.model import EnvironmentEvaluator, MPCModel
 

@@ -15,7 +15,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from .episode_builder import EpisodeBuilder
 from .plants import check_spaces, check_unchanged, check_units, in_units, no_end, opened, plain_spec, step_cap
 from .policy_origin import policy_origin
-from .recording import Recording
+from .session import Recording
 from .stage_cost import PlantInfo, reward_of
 from .watching import plant_of, watched
 

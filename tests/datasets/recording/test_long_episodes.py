@@ -14,7 +14,7 @@ from crashing import run_and_kill
 from stable_baselines3 import DDPG
 
 from mpcoffline.datasets import MinariRecorder, record, repair
-from mpcoffline.datasets.record import episode_builder
+from mpcoffline.datasets.recording import episode_builder
 
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 LONG = "test/long-v0"

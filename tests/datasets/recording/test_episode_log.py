@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mpcoffline.core.errors import FileFormatError
-from mpcoffline.datasets.record import episode_log, log_format
-from mpcoffline.datasets.record.episode_log import EpisodeLog, scan
-from mpcoffline.datasets.record.log_format import LoggedEpisode, LogHeader
+from mpcoffline.datasets.recording import episode_log, log_format
+from mpcoffline.datasets.recording.episode_log import EpisodeLog, scan
+from mpcoffline.datasets.recording.log_format import LoggedEpisode, LogHeader
 
 HEADER = LogHeader("test/log-v0", "name", "new", "{}", "{}")
 

@@ -20,8 +20,8 @@ from crashing import DATASET, check_survivors, count_calls, episode, kill_at_cal
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, StorageError, UnknownIdError
 from mpcoffline.datasets import load_dataset, repair
-from mpcoffline.datasets.record.episode_log import scan
-from mpcoffline.datasets.record.recording import seal
+from mpcoffline.datasets.recording.episode_log import scan
+from mpcoffline.datasets.recording.session import seal
 from mpcoffline.datasets.store.manifest import read_manifest, sha256_of, write_manifest
 from mpcoffline.datasets.store.recording_lock import log_files
 

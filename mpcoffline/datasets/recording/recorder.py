@@ -20,7 +20,7 @@ from mpcoffline.datasets.table.numbers import check_storable
 
 from .episode_builder import EpisodeBuilder
 from .plants import common_spec
-from .recording import Recording
+from .session import Recording
 from .stage_cost import PlantInfo
 from .vec_watching import VecWatch
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
-from mpcoffline.datasets.record.stage_cost import PlantInfo, number_of, reward_of, same_in_float32
+from mpcoffline.datasets.recording.stage_cost import PlantInfo, number_of, reward_of, same_in_float32
 
 NUMBERS = st.floats(-1e30, 1e30)
 
