@@ -232,6 +232,8 @@ def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[Constra
                 actual=f"a list with {constraint!r}",
             )
     fitted = tuple(constraint.fitted(sizes) for constraint in given)
+    if others := [form for form in fitted if not isinstance(form, Constraint | StateBounds)]:
+        raise InvalidArgumentError("fitted", expected="a Constraint or StateBounds", actual=repr(others[0])[:200])
     names = [constraint.name for constraint in fitted]
     if len(set(names)) < len(names):
         raise InvalidArgumentError("names of constraints", expected="unique names", actual=str(names))

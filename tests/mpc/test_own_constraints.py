@@ -75,9 +75,12 @@ def test_a_registered_one_is_saved_as_its_class_says(monkeypatch: pytest.MonkeyP
         again(document)
 
 
-def test_what_is_refused() -> None:
+def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InvalidArgumentError, match="unique names"):
         problem(Disc(1.0), Disc(2.0))
+    monkeypatch.setattr(Disc, "fitted", lambda self, sizes: None)
+    with pytest.raises(InvalidArgumentError, match="fitted: expected a Constraint or StateBounds, got None"):
+        problem(Disc(1.0))
     with pytest.raises(InvalidArgumentError, match="expected the methods from_json, to_json"):
         CONSTRAINTS.add("disc", Disc)
     assert "disc" not in CONSTRAINTS
