@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.learning import Change, FitResult, Known, Method, Stage, Training, ValueFunction
-from mpcoffline.learning.stages import Arrays
+from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
+from mpcoffline.learning.stages import Arrays, Change
 from mpcoffline.mpc import MPC
 
 

@@ -7,7 +7,7 @@ from .bellman.regression import ParameterConfig, ParameterTraining, fit_paramete
 from .bellman.stages import StartConfig, TerminalConfig
 from .method import METHODS, Method
 from .paper import Paper
-from .stages import Change, FitResult, Known, Stage, Training
+from .stages import FitResult, Known, Stage, Training
 from .terminal import DistillConfig, TerminalError, fit_terminal, terminal_error
 from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueMethod, ValueTraining, fit_value
 from .value.noise import Stochasticity, estimate_stochasticity
@@ -16,7 +16,6 @@ __all__ = [
     "METHODS",
     "VALUE_METHODS",
     "Bellman",
-    "Change",
     "DistillConfig",
     "FitResult",
     "Known",

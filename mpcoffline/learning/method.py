@@ -62,7 +62,7 @@ class Method(ABC):
 
     @abstractmethod
     def stages(self) -> dict[str, Stage | Change]:
-        """The stages by name, in their order."""
+        """The stages by name, in their order; one without steps is a function from ``Known`` to ``Known``."""
 
     @property
     def name(self) -> str:

@@ -13,7 +13,8 @@ import pytest
 from mpcoffline import OfflineMPCLearner
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
-from mpcoffline.learning import METHODS, Change, FitResult, Known, Method, Stage, Training
+from mpcoffline.learning import METHODS, FitResult, Known, Method, Stage, Training
+from mpcoffline.learning.stages import Change
 
 
 # ---------------------------------------------------------------- what an author writes
