@@ -190,7 +190,7 @@ def test_a_value_method(add: Add, tmp_path: Path) -> None:
         learner = OfflineMPCLearner(problem(), value=value, **BRIEF)
         learner.fit(table(), show_progress=False)
         learner.save(tmp_path / "learner.zip")
-        assert OfflineMPCLearner.load(tmp_path / "learner.zip").config == learner.config
+        assert OfflineMPCLearner.load(tmp_path / "learner.zip").method == learner.method
 
 
 def test_an_executor(add: Add) -> None:
