@@ -1,7 +1,8 @@
-"""The tasks of arXiv:2301.01667 as Gymnasium environments, and the door for others: one file a plant.
+"""The tasks of arXiv:2301.01667 and one more as Gymnasium environments, and the door for others: one file a plant.
 
-Importing this package registers ``mpcoffline/LinearTracking-v0``, ``mpcoffline/PendulumSwingUp-v0`` and
-``mpcoffline/CartPoleSwingUp-v0``. It needs numpy and gymnasium only, and pygame to draw.
+Importing this package registers ``mpcoffline/LinearTracking-v0``, ``mpcoffline/PendulumSwingUp-v0``,
+``mpcoffline/CartPoleSwingUp-v0`` and ``mpcoffline/PlanarQuadrotor-v0``. It needs numpy and gymnasium only, and pygame
+to draw.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from .linear_tracking import LinearTrackingEnv
 from .pendulum_swing_up import PendulumSwingUpEnv
 
 from .cartpole_swing_up import CartPoleSwingUpEnv  # isort: skip -- the order of the list of plants
+from .planar_quadrotor import PlanarQuadrotorEnv
 from .plant import Input, Nominal, Parameter, Plant, State, Uniform
 from .registry import PLANTS, plant_of, register
 
@@ -24,6 +26,7 @@ __all__ = [
     "Nominal",
     "Parameter",
     "PendulumSwingUpEnv",
+    "PlanarQuadrotorEnv",
     "Plant",
     "State",
     "Uniform",

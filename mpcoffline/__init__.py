@@ -2,8 +2,8 @@
 
 The method is that of Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement
 Learning", arXiv:2301.01667. Importing this package registers the environments ``mpcoffline/LinearTracking-v0``,
-``mpcoffline/PendulumSwingUp-v0`` and ``mpcoffline/CartPoleSwingUp-v0``; torch, CasADi, Stable-Baselines3 and Minari
-load when first used.
+``mpcoffline/PendulumSwingUp-v0``, ``mpcoffline/CartPoleSwingUp-v0`` and ``mpcoffline/PlanarQuadrotor-v0``; torch,
+CasADi, Stable-Baselines3 and Minari load when first used.
 """
 
 from __future__ import annotations

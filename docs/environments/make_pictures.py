@@ -32,11 +32,19 @@ def track(s: np.ndarray) -> Any:
     return -9.0 * s[:2] - 4.0 * s[2:]
 
 
+def fly(s: np.ndarray) -> Any:
+    """Tilts towards the target, and lifts what is below it."""
+    x, z, phi, xd, zd, phid = s
+    tilt = np.clip(-0.5 * x - 0.6 * xd, -0.6, 0.6)
+    return [4.9 - 3.0 * z - 2.0 * zd, 0.2 * (tilt - phi) - 0.05 * phid]
+
+
 #: Environment: picture, start, controller, steps.
 SCENES: dict[str, tuple[str, list[float], Controller, int]] = {
     "mpcoffline/PendulumSwingUp-v0": ("pendulum", [2.9, 0.0], swing_pendulum, 20),
     "mpcoffline/CartPoleSwingUp-v0": ("cartpole", [-0.5, 0.0, 3.0, 0.0], swing_cartpole, 41),
     "mpcoffline/LinearTracking-v0": ("linear", [-0.9, 0.2, -0.4, 1.8], track, 3),
+    "mpcoffline/PlanarQuadrotor-v0": ("quadrotor", [-1.1, -0.7, 0.6, 0.3, 0.0, 0.0], fly, 11),
 }
 
 

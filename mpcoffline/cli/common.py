@@ -27,7 +27,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.core.outputs import check_output
 from mpcoffline.envs import PLANTS, ControlTask
 
-from .others import AddedCommand, added_commands
+from .others import AddedCommand, added_commands, import_plants
 
 if TYPE_CHECKING:
     from gymnasium import Env
@@ -52,6 +52,7 @@ console = SafeConsole()
 messages = SafeConsole(stderr=True, soft_wrap=True, highlight=False)
 
 
+import_plants()
 Task = StrEnum("Task", {plant.name: plant.name for plant in PLANTS.values()})  # type: ignore[misc]
 
 

@@ -1,11 +1,14 @@
-"""Commands that other packages add: one entry point each, in the group ``mpcoffline.commands``.
+"""Commands and plants that other packages add: one entry point each, in two groups.
 
-A package ``pyproject.toml`` says ``[project.entry-points."mpcoffline.commands"]`` and ``hello = "package.module:app"``;
-``app`` is a ``typer.Typer``. Help and completion name the command; the package is imported when it is called.
+A ``pyproject.toml`` says ``[project.entry-points."mpcoffline.commands"]`` and ``hello = "package.module:app"``, where
+``app`` is a ``typer.Typer``. Help and completion name the command; the package is imported when it is called. In
+``[project.entry-points."mpcoffline.plants"]``, ``tank = "package.tank"`` is the module that registers a plant; it is
+imported when the command line starts, as the plant's name is that of a task.
 """
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -13,7 +16,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.errors import InvalidArgumentError, visible
 
 GROUP = "mpcoffline.commands"
 
@@ -56,3 +59,12 @@ def added_commands() -> dict[str, AddedCommand]:
     for entry in entry_points(group=GROUP):
         found[entry.name].append(entry)
     return {name: AddedCommand(entries) for name, entries in sorted(found.items())}
+
+
+def import_plants() -> None:
+    """Imports what registers the plants of installed packages; a broken one is named and breaks nothing else."""
+    for entry in entry_points(group="mpcoffline.plants"):
+        try:
+            entry.load()
+        except Exception as error:  # whatever goes wrong in that package
+            sys.stderr.write(visible(f"Without the plant of {entry.value!r}: {type(error).__name__}: {error}\n"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -100,3 +101,17 @@ def test_help_without_other_packages_has_no_panel_for_them() -> None:
     code = "from mpcoffline.cli import app; app(['--help'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "Other packages" not in done.stdout
+
+
+def test_a_plant_is_a_task_of_the_command_line(tmp_path: Path) -> None:
+    folder = tmp_path / "own_plant-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: own_plant\nVersion: 1.0\n")
+    entries = "[mpcoffline.plants]\nspring = own_plant\nbroken = absent_of_a_test\n"
+    (folder / "entry_points.txt").write_text(entries)
+    paths = os.pathsep.join((str(tmp_path), str(Path(__file__).parents[1] / "helpers")))
+    command = [sys.executable, "-m", "mpcoffline", "learn", "spring"]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, check=False)
+    assert done.returncode == 1  # the task is known, and has no data set
+    assert "Without the plant of 'absent_of_a_test': ModuleNotFoundError" in done.stderr
+    assert "task: expected one of" in done.stderr

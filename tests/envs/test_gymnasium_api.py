@@ -154,7 +154,9 @@ def test_the_documentation_page_is_complete(env_id: str) -> None:
     parameters = list(inspect.signature(type(plant)).parameters)
     documented = [line.split("`")[1] for line in arguments.splitlines() if line.strip().startswith("| `")]
     assert documented == parameters
-    assert f"Box({plant.action_space.low[0]}, {plant.action_space.high[0]}, {plant.action_space.shape}" in page
+    bounds = ([c.low for c in plant.plant.inputs], [c.high for c in plant.plant.inputs])
+    low, high = (str(bound if len(set(bound)) > 1 else bound[0]) for bound in bounds)
+    assert f"Box({low}, {high}, {plant.action_space.shape}" in page
     rows = page.split("## State Space")[1].split("## Rewards")[0]
     assert "`state_space`" in rows
     assert plant.metadata["render_fps"] == round(1.0 / plant.dt)

@@ -74,7 +74,7 @@ def test_the_agent_sees_scaled_observations_and_rewards(task: str) -> None:
     action = np.full((1, *env.action_space.shape), 0.5, np.float32)
     _, reward, _, infos = env.step(action)
     cost = 0.1 * infos[0]["cost"]
-    np.testing.assert_allclose(reward[0], -np.sqrt(cost) if task == "linear" else -cost, rtol=1e-6)
+    np.testing.assert_allclose(reward[0], -np.sqrt(cost) if recipe.reward_form == "sqrt" else -cost, rtol=1e-6)
     assert agent.gamma == 0.9
 
 
