@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from mpcoffline.cli import doctor
 from mpcoffline.cli.main import app
+from mpcoffline.datasets.store.local import shipped_datasets
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +35,7 @@ def test_here_everything_needed_works() -> None:
     assert found["ok"] is True
     assert checks["Python"]["found"].startswith(platform.python_version())
     assert {checks[name]["status"] for name in ("torch", "casadi", "solver lqr", "solver ipopt", "data sets")} == {"ok"}
-    assert checks["data sets"]["found"] == "3 shipped, 0 local"
+    assert checks["data sets"]["found"] == f"{len(shipped_datasets())} shipped, 0 local"
     assert all(check["advice"] for check in checks.values() if check["status"] != "ok")
 
 

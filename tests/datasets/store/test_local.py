@@ -25,20 +25,22 @@ from mpcoffline.datasets.store.packed import pack, packed_size, unpack
 from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.envs import ControlTask
 
-SHIPPED = ["mpcoffline/cartpole/ddpg-v0", "mpcoffline/linear/ddpg-v0", "mpcoffline/pendulum/ddpg-v0"]
+SHIPPED = sorted(f"mpcoffline/{task}/ddpg-v0" for task in recorded_tasks())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dataset_id", SHIPPED)
-def test_shipped_data_are_500_episodes_that_the_environment_repeats(dataset_id: str) -> None:
-    load_dataset(dataset_id)
-    dataset = minari.load_dataset(dataset_id)  # Minari alone reads it from now on
-    assert (dataset.total_episodes, dataset.total_steps) == (500, 50_000)
+@pytest.mark.parametrize("task_name", recorded_tasks())
+def test_shipped_data_are_episodes_that_the_environment_repeats(task_name: str) -> None:
+    recipe = Recipe.load(task_name)
+    load_dataset(recipe.dataset_id)
+    dataset = minari.load_dataset(recipe.dataset_id)  # Minari alone reads it from now on
+    n_episodes = recipe.steps // 100
+    assert (dataset.total_episodes, dataset.total_steps) == (n_episodes, recipe.steps)
     env = dataset.recover_environment()
     assert env.spec is not None
-    assert env.spec.id == Recipe.load(dataset_id.split("/")[1]).env_id
+    assert env.spec.id == recipe.env_id
     assert env.spec.max_episode_steps == 100
-    for episode in dataset.iterate_episodes([0, 1, 250, 499]):
+    for episode in dataset.iterate_episodes([0, 1, n_episodes // 2, n_episodes - 1]):
         observation, _ = env.reset(options={"state": episode.infos["state"][0]})
         np.testing.assert_allclose(episode.observations[0], observation, rtol=1e-6)
         for k in range(100):
@@ -56,7 +58,8 @@ def test_shipped_data_are_500_episodes_that_the_environment_repeats(dataset_id: 
         assert list(episode.truncations) == [False] * 99 + [True]
     # The agent learned: the last tenth of its training against the first, exploration included.
     costs = -np.array([episode.rewards.sum() for episode in dataset.iterate_episodes()])
-    assert np.median(costs[-50:]) < 0.6 * np.median(costs[:50])
+    tenth = n_episodes // 10
+    assert np.median(costs[-tenth:]) < 0.6 * np.median(costs[:tenth])
     table = TransitionTable.from_minari(dataset)
     task = env.unwrapped
     assert isinstance(task, ControlTask)
@@ -112,8 +115,9 @@ def test_listing_says_where_data_sets_are() -> None:
     rows = {row.id: row for row in list_datasets()}
     assert (rows["test/mine-v0"].where, rows["test/mine-v0"].episodes, rows["test/mine-v0"].steps) == ("local", 2, 10)
     assert rows["mpcoffline/pendulum/ddpg-v0"].where == "local"
-    for dataset_id in SHIPPED:
-        assert (rows[dataset_id].episodes, rows[dataset_id].steps) == (500, 50_000)
+    for recipe in map(Recipe.load, recorded_tasks()):
+        row = rows[recipe.dataset_id]
+        assert (row.episodes, row.steps) == (recipe.steps // 100, recipe.steps)
 
 
 @pytest.mark.parametrize(

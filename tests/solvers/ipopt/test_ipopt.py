@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from mpc_problems import random_states
 from numpy.typing import NDArray
 from riccati import optimum
 from scipy.optimize import minimize
@@ -28,15 +29,6 @@ Array = NDArray[np.float64]
 def solver_of(env_id: str, horizon: int, tolerance: float = 1e-8) -> IpoptSolver:
     mpc = nominal_mpc(env_id, alpha=0.0).replace(horizon=horizon)
     return IpoptSolver(mpc, tolerance=tolerance)
-
-
-def states_of(env_id: str, n: int, seed: int = 0) -> Array:
-    rng = np.random.default_rng(seed)
-    if env_id == LINEAR:
-        return rng.uniform(-1, 1, size=(n, 4))
-    angle, speed = rng.uniform(-np.pi, np.pi, n), rng.uniform(-3, 3, n)
-    y = np.stack([np.cos(angle), np.sin(angle), speed], axis=1)
-    return y if env_id == PENDULUM else np.hstack([rng.uniform(-1, 1, size=(n, 2)), y])
 
 
 def actions_of(mpc: MPC, n: int, seed: int = 1) -> Array:
@@ -109,7 +101,7 @@ def test_the_nominal_cost_would_not_do() -> None:
 def test_q_value_is_at_least_the_value(env_id: str, horizon: int) -> None:
     """Q_th(s, a) >= V_th(s), with equality at the solution. ipopt's relative tolerance 1e-8, times the value's size."""
     solver = solver_of(env_id, horizon)
-    x = states_of(env_id, 8)
+    x = random_states(env_id, 8)
     solution = solver.solve(x)
     assert solution.success.all()
     tolerance = 1e-6 * (1.0 + np.abs(solution.value))
@@ -124,7 +116,7 @@ def test_q_value_is_at_least_the_value(env_id: str, horizon: int) -> None:
 def test_solutions_obey_the_problem(env_id: str, horizon: int) -> None:
     solver = solver_of(env_id, horizon)
     mpc = solver.mpc
-    x = states_of(env_id, 8)
+    x = random_states(env_id, 8)
     solution = solver.solve(x)
     np.testing.assert_array_equal(solution.x[:, 0], x)
     np.testing.assert_array_equal(solution.u0, solution.u[:, 0])
@@ -137,7 +129,7 @@ def test_solutions_obey_the_problem(env_id: str, horizon: int) -> None:
 
 def test_an_imposed_input_is_the_first() -> None:
     solver = solver_of(PENDULUM, 10)
-    x, u = states_of(PENDULUM, 5), actions_of(solver.mpc, 5)
+    x, u = random_states(PENDULUM, 5), actions_of(solver.mpc, 5)
     solution = solver.solve(x, u0=u)
     np.testing.assert_allclose(solution.u0, u, rtol=0, atol=1e-12)
     np.testing.assert_allclose(solution.x[:, 1], solver.mpc.model(x, u), rtol=0, atol=1e-6)
@@ -159,7 +151,7 @@ def test_against_single_shooting_by_scipy(env_id: str, horizon: int) -> None:
     gradient = ca.Function("g", [u, s], [ca.gradient(cost, u)])
     bounds = list(zip(np.tile(mpc.action_low, horizon), np.tile(mpc.action_high, horizon), strict=True))
     rng = np.random.default_rng(0)
-    for state in states_of(env_id, 4):
+    for state in random_states(env_id, 4):
         found = [
             minimize(
                 lambda v, state=state: rollout_cost(mpc, state, v.reshape(shape)),
@@ -271,7 +263,7 @@ def assert_same(left: Solution, right: Solution) -> None:
 @pytest.mark.parametrize(("env_id", "horizon"), [(LINEAR, 10), (PENDULUM, 10)])
 def test_a_batch_equals_one_by_one(env_id: str, horizon: int) -> None:
     solver = solver_of(env_id, horizon)
-    x = states_of(env_id, 4)
+    x = random_states(env_id, 4)
     batch = solver.solve(x)
     assert batch.u0.shape == (4, solver.mpc.nu)
     assert batch.x.shape == (4, horizon + 1, solver.mpc.nx)
@@ -290,10 +282,10 @@ def test_a_batch_equals_one_by_one(env_id: str, horizon: int) -> None:
 
 
 def test_equal_calls_give_equal_results() -> None:
-    x = states_of(PENDULUM, 3)
+    x = random_states(PENDULUM, 3)
     solver = solver_of(PENDULUM, 10)
     first = solver.solve(x)
-    solver.solve(states_of(PENDULUM, 2, seed=9))  # nothing hidden is kept
+    solver.solve(random_states(PENDULUM, 2, seed=9))  # nothing hidden is kept
     assert_same(first, solver.solve(x))
     assert_same(first, IpoptSolver(solver.mpc).solve(x))
     warm = first.plan.shifted()
@@ -303,7 +295,7 @@ def test_equal_calls_give_equal_results() -> None:
 @pytest.mark.parametrize(("env_id", "horizon"), [(LINEAR, 30), (PENDULUM, 30)])
 def test_warm_starts_reach_the_same_value_sooner(env_id: str, horizon: int) -> None:
     solver = solver_of(env_id, horizon)
-    first = solver.solve(states_of(env_id, 4))
+    first = solver.solve(random_states(env_id, 4))
     successor = first.x[:, 1]
     cold = solver.solve(successor)
     warm = solver.solve(successor, warm_start=first.plan.shifted())
@@ -316,7 +308,7 @@ def test_warm_starts_reach_the_same_value_sooner(env_id: str, horizon: int) -> N
 
 def test_rows_of_nan_start_cold() -> None:
     solver = solver_of(PENDULUM, 10)
-    x = states_of(PENDULUM, 3)
+    x = random_states(PENDULUM, 3)
     cold = solver.solve(x)
     plan = cold.plan.select(np.array([True, False, True]))
     assert plan.known.tolist() == [True, False, True]
@@ -330,7 +322,7 @@ def test_rows_of_nan_start_cold() -> None:
 
 def test_a_solution_is_a_warm_start() -> None:
     solver = solver_of(PENDULUM, 10)
-    x = states_of(PENDULUM, 2)
+    x = random_states(PENDULUM, 2)
     batch, one = solver.solve(x), solver.solve(x[0])
     assert repr(solver) == "IpoptSolver(nx=3, nu=1, horizon=10)"
     assert repr(one) == f"Solution(u0={one.u0!r}, value={one.value!r}, success={one.success!r})"
@@ -341,7 +333,7 @@ def test_a_solution_is_a_warm_start() -> None:
 
 def test_a_useless_warm_start_does_no_harm() -> None:
     solver = solver_of(PENDULUM, 10)
-    x = states_of(PENDULUM, 3)
+    x = random_states(PENDULUM, 3)
     cold = solver.solve(x)
     plan = Plan(np.full_like(cold.x, 1e3), np.full_like(cold.u, -50.0))
     misled = solver.solve(x, warm_start=plan)
@@ -429,4 +421,4 @@ def test_unbounded_inputs() -> None:
 def test_the_nominal_tasks_are_solved_at_their_horizons() -> None:
     for env_id in ENV_IDS:
         solver = IpoptSolver(nominal_mpc(env_id))
-        assert solver.solve(states_of(env_id, 10)).success.all()
+        assert solver.solve(random_states(env_id, 10)).success.all()
