@@ -40,14 +40,14 @@ PLANT = Plant(
     id="mpcoffline/PlanarQuadrotor-v0",
     name="quadrotor",
     dt=0.1,
-    # Thrust and gravity add at most 29.8 m/s^2, the torque at most 10 rad/s^2, in the 10 s of an episode.
+    # Thrust and gravity add at most 29.8 m/s^2, the torque 10 rad/s^2, in the 10 s of an episode: 1490 m, 298 m/s.
     states=(
-        State("x", "x", "m", limit=3e3, start=50.0, quantity="position", span=(-2.0, 2.0)),
-        State("z", "z", "m", limit=3e3, start=50.0, quantity="height"),
+        State("x", "x", "m", limit=3e3, start=300.0, quantity="position", span=(-2.0, 2.0)),
+        State("z", "z", "m", limit=3e3, start=300.0, quantity="height"),
         State("phi", r"\varphi", "rad", quantity="tilt", angle=True),
-        State("xd", r"\dot x", "m/s", limit=500.0, start=20.0, quantity="speed", span=(-3.0, 3.0)),
-        State("zd", r"\dot z", "m/s", limit=500.0, start=20.0, quantity="speed"),
-        State("phid", r"\dot\varphi", "rad/s", limit=500.0, start=20.0, quantity="speed"),
+        State("xd", r"\dot x", "m/s", limit=500.0, start=100.0, quantity="speed", span=(-3.0, 3.0)),
+        State("zd", r"\dot z", "m/s", limit=500.0, start=100.0, quantity="speed"),
+        State("phid", r"\dot\varphi", "rad/s", limit=500.0, start=100.0, quantity="speed"),
     ),
     inputs=(
         Input("thrust", "F", "N", 0.0, MAX_THRUST, quantity="thrust"),
@@ -112,8 +112,8 @@ class PlanarQuadrotorEnv(ControlTask):
 
     ## State Space
     The state $s = [x, z, \varphi, \dot x, \dot z, \dot\varphi]$ is in `info["state"]`; `state_space`, a `Box(float64)`,
-    holds the states that `reset` accepts: $|x|, |z| \le 50$ m, speeds up to 20 m/s and 20 rad/s, $\varphi$ wrapped to
-    $(-\pi, \pi]$.
+    holds the states that `reset` accepts: $|x|, |z| \le 300$ m, speeds up to 100 m/s and 100 rad/s, $\varphi$ wrapped
+    to $(-\pi, \pi]$.
 
     ## Rewards
     $r = -L$ with the stage cost
