@@ -38,7 +38,7 @@ nitpicky = True
 # Types in signatures that have no page here: other libraries', and what our own return beside their results.
 nitpick_ignore_regex = [
     ("py:class", r"(?!mpcoffline\.).*"),
-    ("py:class", r"mpcoffline\.\w+\.\w+\.\w+"),
+    ("py:class", r"mpcoffline(\.\w+){3,}"),
     ("py:exc", r"(?!mpcoffline\.).*"),
 ]
 

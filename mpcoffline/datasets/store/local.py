@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DatasetRow:
-    """A data set that :func:`~mpcoffline.datasets.load_dataset` can give.
+    """A data set that :func:`~mpcoffline.load_dataset` can give.
 
     Attributes:
         id: Minari id.
@@ -61,7 +61,7 @@ def open_local(dataset_id: str) -> MinariDataset:
 
 
 def list_datasets() -> list[DatasetRow]:
-    """All data sets that :func:`~mpcoffline.datasets.load_dataset` can give, sorted by id."""
+    """All data sets that :func:`~mpcoffline.load_dataset` can give, sorted by id."""
     rows = {
         name: DatasetRow(name, "local", metadata["total_episodes"], metadata["total_steps"])
         for name, metadata in local_datasets().items()

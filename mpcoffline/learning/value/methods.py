@@ -30,7 +30,7 @@ class ValueMethod(ABC):
     """A loss whose minimum is a value function.
 
     An own one is a frozen dataclass, whose fields are its options; one called ``tau`` is that of the configuration.
-    Registered in :data:`VALUE_METHODS`, it is known by its name, and files can hold it.
+    Registered in ``VALUE_METHODS``, it is known by its name, and files can hold it.
     """
 
     #: Whether a function Q(s, a) is learned beside V.
