@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -185,9 +185,11 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         """The equations of motion: ds/dt, ``(..., nx)``; the next state itself where the plant is discrete."""
         return self._rates(state, _entries(action), self.parameters)
 
-    def _rates(self, state: Array, inputs: list[Array], parameters: dict[str, Any]) -> Array:
-        y = self.plant.lift(_entries(state), np.cos, np.sin)
-        return np.concatenate(self.plant.dynamics(y, inputs, parameters), axis=-1)
+    def _rates(self, state: Array, inputs: list[Any], parameters: dict[str, Any]) -> Array:
+        y = _entries(state)
+        if self.angle is not None:
+            y = self.plant.lift(y, *((_cos, _sin) if state.ndim == 1 else (np.cos, np.sin)))
+        return _joined(self.plant.dynamics(y, inputs, parameters))
 
     def next_state(self, state: Array, action: Array) -> Array:
         """The plant without noise: f(s, a) for s ``(..., nx)`` and a ``(..., nu)`` within bounds."""
@@ -198,11 +200,12 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
 
     def cost(self, state: Array, action: Array) -> Array:
         """The stage cost L(s, a) >= 0, ``(...)``."""
-        return np.asarray(self.plant.cost(_entries(state), _entries(action)))[..., 0]
+        cost = np.asarray(self.plant.cost(_entries(state), _entries(action)))
+        return cost if state.ndim == 1 else cost[..., 0]
 
     def observe(self, state: Array) -> Observation:
         """The observation h(s) without noise, ``(..., ny)`` float32; smooth where s wraps."""
-        y = np.concatenate(self.plant.lift(_entries(state), np.cos, np.sin), axis=-1)
+        y = state if self.angle is None else _joined(self.plant.lift(_entries(state), np.cos, np.sin))
         return y.astype(np.float32)
 
     def is_success(self, state: Array) -> NDArray[np.bool_]:
@@ -364,9 +367,24 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         return {"cost": cost, "state": state.copy(), "is_success": bool(self.is_success(state))}
 
 
-def _entries(array: Array) -> list[Array]:
-    """The columns of ``array (..., n)``, each ``(..., 1)``."""
-    return [array[..., i : i + 1] for i in range(array.shape[-1])]
+def _entries(array: Array) -> list[Any]:
+    """The columns of ``array (..., n)``, each ``(..., 1)``; of one state floats, whose arithmetic is faster."""
+    return array.tolist() if array.ndim == 1 else [array[..., i : i + 1] for i in range(array.shape[-1])]
+
+
+def _joined(entries: Sequence[Any]) -> Array:
+    """The inverse of :func:`_entries`; a plant may have joined some itself."""
+    if isinstance(entries[0], float):
+        return np.array(entries)
+    return entries[0] if len(entries) == 1 else np.concatenate(entries, axis=-1)
+
+
+def _cos(angle: float) -> float:
+    return float(np.cos(angle))  # the C library's may round in another way
+
+
+def _sin(angle: float) -> float:
+    return float(np.sin(angle))
 
 
 def float32_box(low: list[float] | Array, high: list[float] | Array) -> spaces.Box:

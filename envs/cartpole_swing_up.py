@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from . import rendering as style
 from .arguments import Array
 from .base import ControlTask
-from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values, square
 from .registry import register
 from .rendering import Canvas, Moment, clockwise, refined, signed
 
@@ -21,16 +21,16 @@ def dynamics(y: Entries, inputs: Entries, p: Values) -> Entries:
     _, xd, cos, sin, phid = y
     (u,) = inputs
     mass, moment = p["m_c"] + p["m_p"], p["m_p"] * p["l"]
-    friction, square = p["mu"] * xd, phid**2
-    drive = friction - u - moment * square * sin
-    if isinstance(cos, np.ndarray):  # on the unit circle
-        share = p["m_p"] * cos**2 / mass
+    friction, turning = p["mu"] * xd, square(phid)
+    drive = friction - u - moment * turning * sin
+    if isinstance(cos, float | np.ndarray):  # on the unit circle
+        share = p["m_p"] * square(cos) / mass
     else:
         # Dividing by |(cos, sin)|^2 keeps the inertia positive off it, where the iterates of an NLP solver wander. The
         # order of the product differs, and with it the rounding: data and fits made before would not repeat otherwise.
-        share = p["m_p"] / mass * cos**2 / (cos**2 + sin**2)
+        share = p["m_p"] / mass * square(cos) / (square(cos) + square(sin))
     phidd = (p["g"] * sin + cos * drive / mass) / (p["l"] * (4.0 / 3.0 - share))
-    xdd = (u - friction + moment * (square * sin - phidd * cos)) / mass
+    xdd = (u - friction + moment * (turning * sin - phidd * cos)) / mass
     return xd, xdd, phid, phidd
 
 
@@ -38,7 +38,7 @@ def cost(s: Entries, inputs: Entries) -> object:
     """The stage cost."""
     x, xd, phi, phid = s
     (u,) = inputs
-    return 2.0 * x**2 + phi**2 + 0.1 * xd**2 + 0.1 * phid**2 + 0.1 * u**2
+    return 2.0 * square(x) + square(phi) + 0.1 * square(xd) + 0.1 * square(phid) + 0.1 * square(u)
 
 
 def max_friction(p: Values) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from . import rendering as style
 from .arguments import Array, checked_number
 from .base import ControlTask
-from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values, square
 from .registry import register
 from .rendering import Canvas, Moment, refined, signed
 
@@ -54,7 +54,7 @@ def cost(s: Entries, inputs: Entries) -> object:
     """The stage cost s'Ws + a'Ra."""
     x, y, xd, yd = s
     force_x, force_y = inputs
-    return 9.0 * x**2 + 9.0 * y**2 + xd**2 + yd**2 + 0.1 * force_x**2 + 0.1 * force_y**2
+    return 9.0 * square(x) + 9.0 * square(y) + square(xd) + square(yd) + 0.1 * square(force_x) + 0.1 * square(force_y)
 
 
 PLANT = Plant(

@@ -6,7 +6,7 @@ import numpy as np
 
 from . import rendering as style
 from .base import ControlTask
-from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values, square
 from .registry import register
 from .rendering import Canvas, Moment, clockwise, refined, signed
 
@@ -25,7 +25,7 @@ def cost(s: Entries, inputs: Entries) -> object:
     """The stage cost."""
     phi, phid = s
     (u,) = inputs
-    return phi**2 + 0.1 * phid**2 + 0.1 * u**2
+    return square(phi) + 0.1 * square(phid) + 0.1 * square(u)
 
 
 PLANT = Plant(

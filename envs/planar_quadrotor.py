@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from . import rendering as style
 from .arguments import Array
 from .base import ControlTask
-from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values
+from .plant import Entries, Input, Nominal, Parameter, Plant, State, Uniform, Values, square
 from .registry import register
 from .rendering import Canvas, Moment, clockwise, refined, signed
 
@@ -32,8 +32,8 @@ def cost(s: Entries, inputs: Entries) -> object:
     """The stage cost."""
     x, z, phi, xd, zd, phid = s
     thrust, torque = inputs
-    speeds = xd**2 + zd**2 + phid**2
-    return 2.0 * (x**2 + z**2) + phi**2 + 0.1 * speeds + 0.02 * (thrust - HOVER) ** 2 + torque**2
+    speeds = square(xd) + square(zd) + square(phid)
+    return 2.0 * (square(x) + square(z)) + square(phi) + 0.1 * speeds + 0.02 * square(thrust - HOVER) + square(torque)
 
 
 PLANT = Plant(

@@ -1,7 +1,7 @@
 """What a plant is: one description, from which environment, nominal MPC, references, labels and data sets come.
 
-The functions in it are arithmetic on lists of entries and know neither numpy nor CasADi. An entry is an array
-``(..., 1)`` in the environment and a scalar expression in an MPC; so is what they return.
+The functions in it are arithmetic on lists of entries and know neither numpy nor CasADi. An entry is a float in the
+environment, an array ``(n, 1)`` in its vector twin, and a scalar expression in an MPC; so is what they return.
 """
 
 from __future__ import annotations
@@ -23,6 +23,11 @@ Draw = Callable[[np.random.Generator], Array]
 
 # Hanging is in the middle, so that a swing-up starts there and no curve leaves on one side to come back on the other.
 _TURN = (-0.9, 2.0 * np.pi + 0.9)
+
+
+def square(x: Any) -> Any:
+    """``x * x``: as ``x**2``, but with the same bits for a single number as for one among many."""
+    return x * x
 
 
 @dataclass(frozen=True)
