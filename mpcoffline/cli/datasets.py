@@ -49,7 +49,7 @@ def show(
     as_json: Json = False,
 ) -> None:
     """The card and the statistics of a data set."""
-    from mpcoffline.gallery import show as summarise
+    from mpcoffline.datasets import show as summarise
 
     if figure is not None:
         check_figure("--figure", figure)

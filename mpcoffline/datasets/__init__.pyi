@@ -7,6 +7,8 @@ from .check.repairing import RepairReport as RepairReport
 from .check.repairing import repair as repair
 from .check.replaying import ReplayReport as ReplayReport
 from .check.replaying import replay as replay
+from .check.summary import Summary as Summary
+from .check.summary import show as show
 from .hub.loading import load_dataset as load_dataset
 from .hub.transfer import download_dataset as download_dataset
 from .hub.transfer import upload_dataset as upload_dataset

@@ -1,5 +1,3 @@
 """What the package shows, and where it lives: the one list, which type checkers and the lazy loader both read."""
 
 from .collection import collect as collect
-from .summary import Summary as Summary
-from .summary import show as show

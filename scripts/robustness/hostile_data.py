@@ -14,8 +14,7 @@ import numpy as np
 
 from mpcoffline import TransitionTable
 from mpcoffline.core.errors import MPCOfflineError
-from mpcoffline.datasets import list_datasets, load_dataset, repair, verify
-from mpcoffline.gallery import show
+from mpcoffline.datasets import list_datasets, load_dataset, repair, show, verify
 
 from .cases import EQUAL, LET_IN, LIMITS, RAW, WRONG, Finding
 from .honest import SET, Honest

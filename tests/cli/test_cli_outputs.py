@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from mpcoffline.cli.common import SafeConsole
 from mpcoffline.cli.main import app
+from mpcoffline.datasets.check.summary import Summary
 from mpcoffline.datasets.store.verification import Finding, VerifyReport
-from mpcoffline.gallery.summary import Summary
 
 HOSTILE = "\x1b]0;title\x07\x1b[2J\u202e <b>_x_</b>"
 
@@ -36,7 +36,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(
     def worked(*_: object, **__: object) -> None:
         raise AssertionError("the work began")
 
-    for work in ("mpcoffline.learner.OfflineMPCLearner.fit", "mpcoffline.gallery.summary._columns"):
+    for work in ("mpcoffline.learner.OfflineMPCLearner.fit", "mpcoffline.datasets.check.summary._columns"):
         monkeypatch.setattr(work, worked)
     (tmp_path / "file").write_text("kept")
     (tmp_path / "taken.zip").symlink_to("/dev/full")

@@ -16,11 +16,12 @@ import torch
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.datasets import TransitionTable
+from mpcoffline.datasets.check.coverage import coverage_figure, panels_of
 from mpcoffline.datasets.recipes import Recipe, recorded_tasks
 from mpcoffline.datasets.store.packed import packed_size
 from mpcoffline.envs import PLANTS, ControlTask
 from mpcoffline.gallery import collect
-from mpcoffline.gallery.cards import coverage_figure, panels_of, return_figure, write_card
+from mpcoffline.gallery.cards import return_figure, write_card
 from mpcoffline.gallery.collection import collect_with, make_agent, return_curve, score_agent
 from mpcoffline.gallery.shipping import make_shipped
 

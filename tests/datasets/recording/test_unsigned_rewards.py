@@ -10,8 +10,8 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from mpcoffline import TransitionTable
+from mpcoffline.datasets import show
 from mpcoffline.datasets.store.writing import write_dataset
-from mpcoffline.gallery import show
 
 
 @pytest.mark.parametrize("dtype", ["bool", "uint8", "int8", "int64", "float16", "float32", "float64"])

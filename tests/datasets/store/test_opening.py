@@ -22,10 +22,9 @@ from mpcoffline.core.errors import (
     MPCOfflineError,
     UnknownIdError,
 )
-from mpcoffline.datasets import TransitionTable, list_datasets, load_dataset, repair, verify
+from mpcoffline.datasets import TransitionTable, list_datasets, load_dataset, repair, show, verify
 from mpcoffline.datasets.store import opening, packed
 from mpcoffline.datasets.store.manifest import MANIFEST
-from mpcoffline.gallery import show
 
 ID = "test/set-v0"
 READERS: dict[str, Callable[[str], Any]] = {

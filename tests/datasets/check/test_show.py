@@ -13,8 +13,8 @@ from rich.console import Console
 
 import mpcoffline.datasets as package
 from mpcoffline.core.errors import InvalidDataError, UnknownIdError
+from mpcoffline.datasets.check.summary import coverage, show
 from mpcoffline.datasets.recipes import catalog_file
-from mpcoffline.gallery.summary import coverage, show
 
 
 def test_the_numbers_are_those_of_the_data(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from mpcoffline.datasets.store.local import shipped_datasets
 from mpcoffline.datasets.table.numbers import check_numbers
 from mpcoffline.envs import plant_of
 
-from .cards import Axis, coverage_figure, panels_of
+from .coverage import Axis, coverage_figure, panels_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
