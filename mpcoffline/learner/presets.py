@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mpcoffline.learning import Bellman, Method, Paper, ParameterConfig, StartConfig, TerminalConfig, ValueConfig
+from mpcoffline.learning import Bellman, Method, ParameterConfig, StartConfig, TerminalConfig, ValueConfig
 
 _DEFAULT = Bellman(
     least_discount=0.95,
@@ -20,7 +20,7 @@ _DEFAULT = Bellman(
 
 PRESETS: dict[str, Method] = {
     # The published recipe: (VALUE) by Bellman residual, then (FIT); discount, horizon and terminal cost are the MPC's.
-    "paper": Paper(),
+    "paper": Bellman(),
     # What most users should get: the model by identification, the stage cost by (FIT), the terminal cost from V.
     "default": _DEFAULT,
     # The same at a third of the horizon, which leaves more to the terminal cost: it has to be closer to V.

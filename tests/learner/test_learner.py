@@ -301,7 +301,7 @@ def test_the_preset_is_the_default_one() -> None:
         ({"seed": 0.5}, InvalidArgumentError, "seed"),
         ({"method": "papr"}, UnknownIdError, "learning method: .*Did you mean 'paper'"),
         ({"method": "paper", "preset": "paper"}, InvalidArgumentError, "preset: expected none beside a method"),
-        ({"preset": "paper", "init": "identified"}, UnknownIdError, "got 'init'.* method 'bellman' has it"),
+        ({"method": "paper", "init": "identified"}, UnknownIdError, "got 'init'.* method 'bellman' has it"),
         ({"method": "bellman", "potential": True}, InvalidArgumentError, "got terminal='given'"),
         ({"preset": "paper", "potential": True}, InvalidArgumentError, "potential: expected a terminal cost from V"),
         ({"value_function": lq_plant.QuadraticValue(np.eye(3))}, InvalidArgumentError, "value_function: .* 2 coord"),

@@ -159,7 +159,7 @@ def test_the_paper_is_a_method_and_the_default_one_without_its_additions() -> No
         one.fit(lq_plant.random_log(200), show_progress=False)
         np.testing.assert_array_equal(one.theta, fits[0].theta)
         assert one.history == fits[0].history
-    assert [one.method.name for one in fits] == ["paper", "bellman", "paper"]
+    assert [one.method.name for one in fits] == ["paper", "bellman", "bellman"]
 
 
 def test_a_method_without_steps_or_result() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from lq_plant import make_mpc
 
+from mpcoffline import OfflineMPCLearner
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.learner.presets import PRESETS
 from mpcoffline.learning import METHODS, Bellman, Paper, ParameterConfig, ValueConfig
@@ -32,7 +33,13 @@ def test_the_paper_preset_changes_nothing_of_the_mpc() -> None:
     assert PRESETS["paper"].restructured(mpc).to_json() == mpc.to_json()
     options = PRESETS["paper"].options
     assert (options["value"], options["prediction_weight"], options["fit_n_steps"]) == ("residual", 0.0, 1_000)
-    assert list(PRESETS["paper"].stages()) == ["value", "fit"]
+    assert (options["init"], options["terminal"]) == ("nominal", "given")
+
+
+def test_what_is_asked_for_wins_over_the_paper_preset() -> None:
+    learner = OfflineMPCLearner(make_mpc(), preset="paper", terminal="network", init="identified")
+    assert (learner.method.options["terminal"], learner.method.options["init"]) == ("network", "identified")
+    assert list(METHODS["paper"]().stages()) == ["value", "fit"]
 
 
 @pytest.mark.parametrize("name", METHODS)
