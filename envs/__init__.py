@@ -14,7 +14,7 @@ from .pendulum_swing_up import PendulumSwingUpEnv
 from .cartpole_swing_up import CartPoleSwingUpEnv  # isort: skip -- the order of the list of plants
 from .planar_quadrotor import PlanarQuadrotorEnv
 from .plant import Input, Nominal, Parameter, Plant, State, Uniform
-from .registry import PLANTS, plant_of, register
+from .registry import PLANTS, find_plant, register
 
 __all__ = [
     "ENV_IDS",
@@ -30,7 +30,7 @@ __all__ = [
     "Plant",
     "State",
     "Uniform",
-    "plant_of",
+    "find_plant",
     "register",
 ]
 

@@ -179,7 +179,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
 
     def start_bound(self) -> Array:
         """The largest absolute values of a state that ``reset`` accepts, ``(nx,)``."""
-        return np.array([c.start for c in self.plant.states])
+        return np.array([c.largest_start for c in self.plant.states])
 
     def derivative(self, state: Array, action: Array) -> Array:
         """The equations of motion: ds/dt, ``(..., nx)``; the next state itself where the plant is discrete."""

@@ -61,7 +61,7 @@ class State:
         symbol: In LaTeX, ``"\\dot\\varphi"``.
         unit: Physical unit.
         limit: Its largest absolute value in the simulation; an angle has none.
-        start: The largest that ``reset`` accepts; of an angle pi.
+        start: The largest that ``reset`` accepts; by default ``limit``, of an angle pi.
         quantity: What it is, in a word.
         angle: Whether it is an angle in rad that wraps, and so two entries of the observation, its cosine and sine.
         band: Half-width around zero that counts as success; None where it does not matter.
@@ -73,12 +73,17 @@ class State:
     symbol: str
     unit: str
     limit: float = math.inf
-    start: float = math.pi
+    start: float | None = None
     quantity: str = ""
     angle: bool = False
     band: float | None = None
     span: tuple[float, float] = (-1.0, 1.0)
     index: int = 0
+
+    @property
+    def largest_start(self) -> float:
+        """The largest absolute value that ``reset`` accepts."""
+        return (math.pi if self.angle else self.limit) if self.start is None else self.start
 
     @property
     def label(self) -> str:

@@ -71,7 +71,7 @@ def register(task: type[ControlTask]) -> type[ControlTaskVectorEnv]:
     return twin
 
 
-def plant_of(name: str) -> Plant | None:
+def find_plant(name: str) -> Plant | None:
     """The plant of a short name or a Gymnasium id (``"module:"`` before it does not matter); None for another."""
     env_id = name.rsplit(":", 1)[-1]
     return next((plant for plant in PLANTS.values() if env_id in (plant.name, plant.id)), None)

@@ -6,11 +6,7 @@ from typing import Annotated
 
 import typer
 
-from . import datasets as cli_datasets
-from . import figures as cli_figures
-from . import learn as cli_learn
-from . import run as cli_run
-from . import tools as cli_tools
+from . import datasets as cli_datasets, figures as cli_figures, learn as cli_learn, run as cli_run, tools as cli_tools
 from .common import ErrorGroup, console, progress_to_stderr
 
 app = typer.Typer(

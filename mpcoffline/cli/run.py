@@ -110,8 +110,7 @@ def collect(
 
     Takes some minutes on one CPU core.
     """
-    from mpcoffline.gallery.collection import collect as collect_data
-    from mpcoffline.gallery.collection import return_curve
+    from mpcoffline.gallery.collection import collect as collect_data, return_curve
 
     dataset = collect_data(
         task, alpha=alpha, steps=steps, seed=seed, dataset_id=dataset_id, overwrite=overwrite, progress=True

@@ -56,8 +56,7 @@ def clean(
     when needed. **downloads** that broke off, and **backups** of repaired data sets, only if named. Data sets, and
     recordings that `mpcoffline datasets repair` can finish, are never touched.
     """
-    from mpcoffline.datasets.check.cleaning import DEFAULT_KINDS
-    from mpcoffline.datasets.check.cleaning import clean as look
+    from mpcoffline.datasets.check.cleaning import DEFAULT_KINDS, clean as look
 
     report = look([kind.value for kind in kinds] if kinds else DEFAULT_KINDS, remove_found=yes)
     if as_json:

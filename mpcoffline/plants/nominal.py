@@ -9,6 +9,7 @@ import numpy as np
 
 from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.envs import PLANTS, Plant
 from mpcoffline.envs.episode import DISCOUNT
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
@@ -39,7 +40,7 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
 
     Raises:
         UnknownIdError: For an environment of no registered plant.
-        InvalidArgumentError: For an alpha that can make a parameter non-positive, an alpha for a plant that takes none,
+        InvalidArgumentError: For an alpha with which a parameter could vanish, an alpha for a plant that takes none,
             or a negative seed.
     """
     by_id = {plant.id: plant for plant in PLANTS.values()}
@@ -86,21 +87,28 @@ def _dynamics(plant: Plant) -> Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
 def _parameters(plant: Plant, alpha: float, seed: int | None) -> dict[str, Parameter]:
     """The parameters with their errors; learning may move each from 1/100 to 100 times the plant's value."""
     learned = [(p, np.asarray(p.value, np.float64)) for p in plant.parameters if p.spread is not None]
-    limit = min((float(value) / p.spread for p, value in learned if p.spread), default=0.0)
-    if limit == 0.0 and alpha != 0.0:
+    spread = [(p.spread, np.abs(value[value != 0.0])) for p, value in learned if p.spread]
+    limit = min((float(size.min(initial=np.inf)) / width for width, size in spread), default=0.0)
+    if not spread and alpha != 0.0:
         hint = f"Give alpha to the environment: gym.make({plant.id!r}, alpha=...)." if plant.max_alpha else ""
         expected = f"none for the {plant.name} task, whose nominal model is fixed"
         raise InvalidArgumentError("alpha", expected=expected, actual=str(alpha), hint=hint)
-    if limit and not 0.0 <= alpha < limit:
+    if spread and not 0.0 <= alpha < limit:
         raise InvalidArgumentError(
             "alpha",
-            expected=f"a number from 0 to below {limit:g}, so that no mass or length can vanish",
+            expected=f"a number from 0 to below {limit:g}, so that no parameter can vanish",
             actual=str(alpha),
         )
     draws = np.random.default_rng(seed).uniform(-1.0, 1.0, size=len(learned))
     parameters = {}
     for (p, true), draw in zip(learned, draws, strict=True):
         value = true + alpha * p.spread * draw if p.spread else true
-        bounds = {"low": np.minimum(0.01 * true, value), "high": 100.0 * true} if p.spread else {}
-        parameters[p.name] = Parameter(value, unit=p.unit, **bounds)
+        parameters[p.name] = Parameter(value, unit=p.unit, **(_bounds(true, value) if p.spread else {}))
     return parameters
+
+
+def _bounds(true: Array, value: Array) -> dict[str, Array]:
+    """From 1/100 to 100 times a number of either sign, and to where MPC_1 begins; a zero has no size, and no bounds."""
+    ends = 0.01 * true, 100.0 * true
+    low, high = np.minimum(np.minimum(*ends), value), np.maximum(np.maximum(*ends), value)
+    return {"low": np.where(true == 0.0, -np.inf, low), "high": np.where(true == 0.0, np.inf, high)}

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
-from mpcoffline.envs import PLANTS, ControlTask, Plant, State, plant_of
+from mpcoffline.envs import PLANTS, ControlTask, Plant, State, find_plant
 
 #: Horizontal coordinate, vertical coordinate and values on a grid, each ``(n, n)``.
 Landscape = tuple[Array, Array, Array]
@@ -29,7 +29,7 @@ def task_of(env: gym.Env[Any, Any] | str) -> tuple[ControlTask, Plant]:
     """
     made: gym.Env[Any, Any] = gym.make(env) if isinstance(env, str) else env
     name = made.spec.id if made.spec is not None else ""
-    task, plant = made.unwrapped, plant_of(name)
+    task, plant = made.unwrapped, find_plant(name)
     if not isinstance(task, ControlTask) or plant is None:
         known = ", ".join(known.id for known in PLANTS.values())
         raise InvalidArgumentError("env", expected=f"one of {known}", actual=name or str(env))

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from lq_plant import make_mpc, random_log
 
 from mpcoffline.control.policy import MPCPolicy

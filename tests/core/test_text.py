@@ -6,8 +6,7 @@ import re
 import time
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.text import c_comment, c_identifiers, check_name, check_unit, markdown, markdown_code, visible

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mpcoffline.diagnostics.measures import LagCheck
 from mpcoffline.diagnostics.verdict import Comparison, decide

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 from task_ids import CARTPOLE, LINEAR, PENDULUM
 
-from mpcoffline.envs import ENV_IDS, ControlTask, plant_of
+from mpcoffline.envs import ENV_IDS, ControlTask, find_plant
 
 A = [[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.8, 0.0], [0.0, 0.0, 0.0, 0.8]]
 
@@ -31,7 +31,7 @@ def cases() -> list[Any]:
     """All tasks with each argument alone, and with all together."""
     found = [pytest.param(LINEAR, {"alpha": 0.5}, id="LinearTracking-alpha")]
     for env_id in ENV_IDS:
-        plant = plant_of(env_id)
+        plant = find_plant(env_id)
         assert plant is not None
         each = {
             "defaults": {},

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mpcoffline import nominal_mpc
 from mpcoffline.datasets.recipes import Recipe
-from mpcoffline.envs import PLANTS, ControlTask, Parameter, Plant, State, plant_of, register
+from mpcoffline.envs import PLANTS, ControlTask, Parameter, Plant, State, find_plant, register
 from mpcoffline.envs.pendulum_swing_up import PLANT, PendulumSwingUpEnv
 
 Array = NDArray[np.float64]
@@ -129,8 +129,8 @@ def test_the_recipe_is_of_this_plant(plant: Plant) -> None:
 
 @every_plant
 def test_found_by_name_and_by_id(plant: Plant) -> None:
-    assert plant_of(plant.name) is plant_of(plant.id) is plant_of(f"mpcoffline:{plant.id}") is plant
-    assert plant_of("CartPole-v1") is None
+    assert find_plant(plant.name) is find_plant(plant.id) is find_plant(f"mpcoffline:{plant.id}") is plant
+    assert find_plant("CartPole-v1") is None
 
 
 # ---------------------------------------------------------------- the door
@@ -230,3 +230,10 @@ def test_registering_the_same_again_changes_nothing() -> None:
 def test_a_description_that_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"plant 'pendulum', {message}|plant 'pendulum'.*{message}"):
         replace(PLANT, **changes)
+
+
+def test_what_reset_accepts_is_by_default_what_the_simulation_does() -> None:
+    """Whatever the unit of a state is."""
+    assert State("p", "p", "Pa", limit=1e7).largest_start == 1e7
+    assert State("phi", "\\varphi", "rad", angle=True).largest_start == np.pi
+    assert State("p", "p", "Pa", limit=1e7, start=2e5).largest_start == 2e5

@@ -14,8 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from task_ids import CARTPOLE, LINEAR, PENDULUM
 
-from mpcoffline.envs import ENV_IDS, ControlTask
-from mpcoffline.envs import rendering as style
+from mpcoffline.envs import ENV_IDS, ControlTask, rendering as style
 from mpcoffline.envs.rendering import Canvas, refined, signed, ticks
 
 CAPTION = 44

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -154,3 +155,18 @@ def test_unknown_environments_name_the_nearest() -> None:
 
 def test_the_id_with_a_module_prefix_is_known() -> None:
     assert nominal_mpc("mpcoffline:mpcoffline/PendulumSwingUp-v0").nx == 3
+
+
+def test_errors_of_parameters_of_either_sign_and_of_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = PLANTS["pendulum"]
+    mass, length, gravity = plant.parameters
+    own = (replace(mass, value=-2.0, spread=0.5), replace(length, value=0.0, spread=0.1), gravity)
+    monkeypatch.setitem(PLANTS, "pendulum", replace(plant, parameters=own))
+    blocks = {block.name: block for block in nominal_mpc(PENDULUM, alpha=1.0, seed=0).space}
+    draws = np.random.default_rng(0).uniform(-1.0, 1.0, size=2)
+    assert float(blocks["model.m"].value) == -2.0 + 0.5 * draws[0]
+    assert (float(blocks["model.m"].low[0]), float(blocks["model.m"].high[0])) == (-200.0, -0.02)
+    assert float(blocks["model.l"].value) == 0.1 * draws[1]
+    assert (float(blocks["model.l"].low[0]), float(blocks["model.l"].high[0])) == (-np.inf, np.inf)
+    with pytest.raises(InvalidArgumentError, match="from 0 to below 4, so that no parameter can vanish"):
+        nominal_mpc(PENDULUM, alpha=4.0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mpcoffline import MPC, Model, MPCPolicy, QuadraticCost, make_solver
 from mpcoffline.solvers.starts import candidate_inputs

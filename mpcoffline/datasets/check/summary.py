@@ -18,7 +18,7 @@ from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.recipes import catalog_file
 from mpcoffline.datasets.store.local import shipped_datasets
 from mpcoffline.datasets.table.numbers import check_numbers
-from mpcoffline.envs import plant_of
+from mpcoffline.envs import find_plant
 
 from .coverage import Axis, coverage_figure, panels_of
 
@@ -131,7 +131,7 @@ def coverage(dataset: MinariDataset, columns: dict[str, NDArray[np.float64]] | N
         columns: As read by :func:`show`; read here if None.
     """
     data = columns if columns is not None else _columns(dataset)
-    plant = plant_of(dataset.env_spec.id) if dataset.env_spec is not None else None
+    plant = find_plant(dataset.env_spec.id) if dataset.env_spec is not None else None
     if plant is not None and "state" in data:
         return coverage_figure(panels_of(plant), data["state"], data["action"])
     size = data["observation"].shape[1]

@@ -195,7 +195,7 @@ def checked(items: Iterable[T], file: SteadyFile) -> Iterator[T]:
 def store_episodes(storage: Any, episodes: Iterable[EpisodeBuffer], *, new: bool) -> None:
     """Minari's ``update_episodes``, with which no full disk and no signal ends the process.
 
-    What is small enough is made in memory, which costs nothing; the rest goes through a :class:`SteadyFile`.
+    What is small enough is made in memory, no slower than on the disk; the rest goes through a :class:`SteadyFile`.
 
     Args:
         storage: Minari's HDF5 storage; not to be used afterwards.

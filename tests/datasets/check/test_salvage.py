@@ -10,8 +10,7 @@ import minari
 import numpy as np
 import pytest
 from crashing import DATASET, episode, recording
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from typer.testing import CliRunner
 
 from mpcoffline.cli.main import app

@@ -20,8 +20,7 @@ from pendulum_data import recorded, stored
 from stand_in_hub import Hub, stand_in_hub
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError, UnknownIdError
-from mpcoffline.datasets.hub import remotes
-from mpcoffline.datasets.hub import transfer as hub_module
+from mpcoffline.datasets.hub import remotes, transfer as hub_module
 from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.hub.remotes import RemoteError
 from mpcoffline.datasets.hub.transfer import download_dataset, find_source, upload_dataset

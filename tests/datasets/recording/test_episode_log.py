@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from crashing import episode
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets.recording import episode_log, log_format

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets.recording.stage_cost import PlantInfo, number_of, reward_of, same_in_float32

@@ -16,8 +16,7 @@ import h5py
 import numpy as np
 import pytest
 from crashing import ACTIONS, DATASET, SPACE, check_survivors, episode, recording
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pendulum_data import recorded, stored
 
 from mpcoffline.core.errors import StorageError

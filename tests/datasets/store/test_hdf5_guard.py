@@ -11,8 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pendulum_data import recorded, resealed, stored
 
 from mpcoffline.core.errors import FileFormatError

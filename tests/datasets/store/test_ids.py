@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from minari.dataset.minari_dataset import gen_dataset_id, parse_dataset_id
 from pendulum_data import stored
 

@@ -7,8 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets.store.manifest import MANIFEST, differences, parse_manifest, read_manifest, write_manifest

@@ -12,16 +12,14 @@ import minari
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from minari.data_collector import EpisodeBuffer
 from pendulum_data import resealed
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.store.writing import write_dataset
-from mpcoffline.datasets.table import build as table_build
-from mpcoffline.datasets.table import cache as table_cache
+from mpcoffline.datasets.table import build as table_build, cache as table_cache
 from mpcoffline.datasets.table.hdf5_episodes import COLUMNS, read_episodes
 from mpcoffline.datasets.table.math import innermost, magnitudes
 

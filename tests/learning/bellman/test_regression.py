@@ -9,8 +9,7 @@ import lq_plant
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from lq_plant import BEST, DISCOUNT, QuadraticValue
 from numpy.typing import NDArray
 

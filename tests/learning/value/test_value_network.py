@@ -6,8 +6,7 @@ import lq_plant
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.learning import ValueFunction

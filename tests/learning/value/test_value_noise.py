@@ -7,8 +7,7 @@ import logging
 import lq_plant
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from mpcoffline.datasets import TransitionTable

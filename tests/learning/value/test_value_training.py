@@ -11,8 +11,7 @@ import numpy as np
 import pendulum_data
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, MPCOfflineError
