@@ -56,7 +56,7 @@ def identified(known: Known, config: StartConfig) -> Known:
     found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    mpc = known.mpc.with_theta(found.theta)
+    mpc = known.mpc.replace(model=found.model)
     return replace(known, mpc=mpc, table=found.table, model_error=found.error_after)
 
 
