@@ -212,7 +212,12 @@ def identify_smoothed(
     result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
     clean = Trajectories.of(mpc, _excerpt(result, seed), first.unwrapped)
     identification = described(
-        mpc, OneStepProblem(mpc, clean.rows(), centre), z, information, config.prior_spread, first.unwrapped
+        mpc,
+        OneStepProblem(mpc, clean.rows(), centre, coordinates.coordinates),
+        z,
+        information,
+        config.prior_spread,
+        first.unwrapped,
     )
     return SmoothedIdentification(identification, result, noise)
 
