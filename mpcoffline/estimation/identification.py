@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -23,6 +22,7 @@ from mpcoffline.mpc.coordinates import Coordinates
 from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
+from .uncertainty import Misfit, clusters, uncertainty
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class IdentificationConfig:
 
 
 @dataclass(frozen=True)
-class Identification:
+class OneStepIdentification:
     """An identified model, and how far it can be trusted.
 
     Errors are root mean squares of the one-step prediction error s+ - f(s,a), a coordinate divided by ``scale``, so
@@ -70,12 +70,14 @@ class Identification:
 
     Attributes:
         theta: All parameters of the MPC, those of the model identified, ``(size,)``.
-        deviation: One standard deviation of each, given data and prior; 0 where not identified, ``(size,)``.
+        deviation: One standard deviation of each, given data and prior, with the episodes' own scatter: errors that
+            last over many rows count as few; 0 where not identified, ``(size,)``.
         scale: Spread of the increments s+ - s, ``(nx,)``.
         errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``.
         errors_after: The same at theta.
         at_bound: Names of the parameters that ended at a bound.
-        undetermined: Parameters, or combinations of them, that the data do not determine; these stay near theta_0.
+        undetermined: Parameters, or combinations of them, that the data do not determine: moved to either side by as
+            much as the prior leaves open, they predict the data as well. These stay near theta_0.
         unwrapped: Coordinates that proved to be wrapped angles.
     """
 
@@ -97,6 +99,16 @@ class Identification:
     def error_after(self) -> float:
         """The same at theta."""
         return float(np.sqrt(np.mean(self.errors_after**2)))
+
+    def warn(self) -> None:
+        """Logs what the user should know."""
+        if self.undetermined:
+            text = "The data do not determine %s; kept near the given values."
+            logger.warning(text, ", nor ".join(self.undetermined))
+        if self.at_bound:
+            logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", self.at_bound)
+        if self.unwrapped:
+            logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(self.unwrapped))
 
 
 class Rows(NamedTuple):
@@ -206,9 +218,9 @@ class OneStepProblem:
         return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
 
 
-def identify(
+def identify_one_step(
     mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
-) -> Identification:
+) -> OneStepIdentification:
     """Identifies the model by least squares of the one-step prediction error.
 
     ::
@@ -217,7 +229,7 @@ def identify(
 
     with scale the spread of the increments s+ - s of each coordinate, z the scaled coordinates of the model parameters
     and sigma^2 the mean square error that remains: the maximum a posteriori estimate, whose prior decides only what
-    the data leave open (a mass and a gear that matter by their ratio alone). Such combinations are named in a warning.
+    the data leave open (a mass and a gear that matter by their ratio alone).
     An entry of s that the data wrap, as an angle, is compared modulo 2 pi.
 
     Args:
@@ -236,37 +248,49 @@ def identify(
     table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
-    problem = OneStepProblem(mpc, _rows(mpc, table, config, rng), centre)
+    rows, episodes = _rows(mpc, table, config, rng)
+    problem = OneStepProblem(mpc, rows, centre)
     rows, unwrapped = without_jumps(problem.rows, problem.errors(mpc.theta) * problem.scale)
     if unwrapped:
         problem = OneStepProblem(mpc, rows, centre)
     if not problem.free.size:
-        return described(mpc, problem, np.zeros(0), np.zeros((0, 0)), config.prior_spread, unwrapped)
+        return described(mpc, problem, np.zeros(0), Misfit.nothing(), config.prior_spread, unwrapped)
     z, prior = _best_descent(problem, config, rng)
-    jacobian = problem.linearised(z)[1].reshape(-1, len(z))
-    information = jacobian.T @ jacobian / len(problem.rows.x) / (prior * config.prior_spread**2)
-    return described(mpc, problem, z, information, config.prior_spread, unwrapped)
+    variance = len(problem.rows.x) * prior * config.prior_spread**2
+    return described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
+
+
+def _misfit(problem: OneStepProblem, z: Array, variance: float, episodes: NDArray[np.integer[Any]]) -> Misfit:
+    """The sum of squared errors over their variance, about z."""
+
+    def sum_of_squares(other: Array) -> float:
+        return float(np.sum(problem.linearised(other)[0] ** 2)) / variance
+
+    errors, jacobian = problem.linearised(z)
+    information = np.einsum("nip,niq->pq", jacobian, jacobian, optimize=True) / variance
+    scores = np.einsum("nip,ni->np", jacobian, errors) / variance
+    return Misfit(sum_of_squares, information, clusters(scores, episodes))
 
 
 def described(
-    mpc: MPC, problem: OneStepProblem, z: Array, information: Array, spread: float, unwrapped: tuple[int, ...] = ()
-) -> Identification:
-    """What was identified, with errors on the problem's rows; warns of what the user should know.
+    mpc: MPC, problem: OneStepProblem, z: Array, misfit: Misfit, spread: float, unwrapped: tuple[int, ...] = ()
+) -> OneStepIdentification:
+    """What was identified, with errors on the problem's rows.
 
     Args:
         mpc: The MPC; its parameters are theta_0.
         problem: The one-step prediction problem.
         z: The identified coordinates.
-        information: The data's information about z (the inverse of their covariance without the prior), ``(p, p)``.
+        misfit: What the data say about z.
         spread: Standard deviation of the prior.
         unwrapped: Coordinates that are wrapped angles.
     """
     theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
-    covariance, undetermined = _uncertainty(information, spread, problem.names)
+    covariance, undetermined = uncertainty(misfit, z, (problem.low, problem.high), spread, problem.names)
     deviation = np.zeros_like(theta)
     identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
     deviation[identified] = np.sqrt(np.diag(covariance)) * np.abs(problem.slopes(z))
-    result = Identification(
+    return OneStepIdentification(
         theta,
         deviation,
         problem.scale,
@@ -276,18 +300,18 @@ def described(
         undetermined,
         unwrapped,
     )
-    _warn(result)
-    return result
 
 
-def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Rows:
-    """A random subset in float64, small enough for its Jacobian."""
+def _rows(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator
+) -> tuple[Rows, NDArray[np.integer[Any]]]:
+    """A random subset in float64, small enough for its Jacobian, and the episode of each row."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
     count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
     sample = table.sample(count, rng)
     columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)
-    return Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
+    return Rows(*(np.asarray(part, dtype=np.float64) for part in parts)), sample.episode_ids
 
 
 def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
@@ -331,21 +355,6 @@ def _best_descent(
     return problem.descend(best.z, prior, config.max_iterations).z, prior
 
 
-def _uncertainty(information: Array, spread: float, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
-    """Covariance of z, and the combinations that stay about as uncertain as the prior."""
-    strengths, directions = np.linalg.eigh(information)
-    known = np.where(strengths > 1e-12 * strengths.max(initial=0.0), strengths, 0.0) * spread**2
-    covariance = spread**2 * (directions / (known + 1.0)) @ directions.T
-    return covariance, tuple(_combination(direction, names) for direction in directions[:, known < 3.0].T)
-
-
-def _combination(direction: Array, names: Sequence[str]) -> str:
-    """A direction in words: the parameters that it moves together, largest first."""
-    order = np.argsort(-np.abs(direction), kind="stable")
-    involved = [names[i] for i in order if abs(direction[i]) > 0.3 * np.abs(direction).max()]
-    return " with ".join(involved[:4]) + (" and others" if len(involved) > 4 else "")
-
-
 def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
     return np.asarray((z - problem.low < _AT_BOUND) | (problem.high - z < _AT_BOUND))
 
@@ -354,12 +363,3 @@ def _root_mean_square(errors: Array) -> Array:
     """Of each coordinate ``(nx,)``, whatever the model predicts."""
     finite = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_LARGEST, neginf=-_LARGEST)
     return np.asarray(np.sqrt(np.mean(np.clip(finite, -_LARGEST, _LARGEST) ** 2, axis=0)))
-
-
-def _warn(result: Identification) -> None:
-    if result.undetermined:
-        logger.warning("The data do not determine %s; kept near the given values.", ", nor ".join(result.undetermined))
-    if result.at_bound:
-        logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", result.at_bound)
-    if result.unwrapped:
-        logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(result.unwrapped))

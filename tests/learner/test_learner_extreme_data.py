@@ -10,7 +10,7 @@ import pytest
 
 from mpcoffline import OfflineMPCLearner, TransitionTable, nominal_mpc
 from mpcoffline.core.errors import InvalidDataError
-from mpcoffline.estimation.identification import identify
+from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc.scaling import cost_spread
 
 QUICK: dict[str, Any] = {
@@ -68,4 +68,4 @@ def test_what_overflows_is_called_that() -> None:
     a, costs = rng.uniform(-2.0, 2.0, (N, 1)), rng.uniform(size=N)
     data = TransitionTable.from_arrays(s[:-1], a, costs, s[1:], np.zeros(N))
     with pytest.raises(InvalidDataError, match=r"identification: .*states up to .*e\+30 .* units"):
-        identify(nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0), data)
+        identify_one_step(nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0), data)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.smoothing import identify_smoothed
+from mpcoffline.estimation import identify
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
@@ -53,11 +53,11 @@ def identified(known: Known, config: StartConfig) -> Known:
     """The table without measurement noise, and the model, where it is learned, by its prediction error."""
     if config.init == "nominal":
         return known
-    found = identify_smoothed(known.mpc, known.table, seed=known.seed)
+    found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    mpc = known.mpc.with_theta(found.identification.theta)
-    return replace(known, mpc=mpc, table=found.table, model_error=found.identification.error_after)
+    mpc = known.mpc.with_theta(found.theta)
+    return replace(known, mpc=mpc, table=found.table, model_error=found.error_after)
 
 
 class LearnValue(Stage):
