@@ -108,7 +108,7 @@ def diagnose(
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
         weights=weight_checks(nominal, learned),
-        at_bounds=bound_names(learned, nominal),
+        at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
         lag=lag,
         noise=found.noise,

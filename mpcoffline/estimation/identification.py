@@ -19,6 +19,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
+from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
 from .uncertainty import Misfit, clusters, uncertainty
@@ -137,14 +138,17 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: Rows, centre: Array | float = 0.0) -> None:
-        self.coordinates = c = Coordinates(mpc, ("model",))
+    def __init__(
+        self, mpc: MPC, rows: Rows, centre: Array | float = 0.0, coordinates: Coordinates | None = None
+    ) -> None:
+        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
+        c = coordinates or Coordinates(mpc, ("model",), Scaling(rows.x, rows.u, self.scale))
+        self.coordinates = c
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
         self.names = [names[i] for i in self.free]
-        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
@@ -317,19 +321,6 @@ def described(
         unwrapped,
         (absurd, len(errors)),
     )
-
-
-def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> Array:
-    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1.
-
-    Args:
-        x: States, ``(n, nx)``.
-        reached: Those after them, ``(n, nx)``.
-        centre: What the table that they are from was packed without, ``(nx,)``: it was not rounded to float32.
-    """
-    spread = (reached - x).std(axis=0)
-    rounding, least = (1e-6 * np.abs(x - offset).max(axis=0) for offset in (centre, 0.0))
-    return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
 
 
 def _rows(

@@ -112,10 +112,10 @@ def _identified(mpc: MPC, table: TransitionTable, config: IdentificationConfig, 
     z, noise, misfit = _most_likely(mpc, few, first, config, (table, source))
     logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
     centre = table.centring.centre[: table.ny]
-    theta = OneStepProblem(mpc, few.rows(), centre).theta(z)
-    smoothed_table = smooth(mpc, table, theta, noise, unwrapped=first.unwrapped)
+    noisy = OneStepProblem(mpc, few.rows(), centre)
+    smoothed_table = smooth(mpc, table, noisy.theta(z), noise, unwrapped=first.unwrapped)
     clean = Trajectories.of(mpc, excerpt(smoothed_table, seed), first.unwrapped)
-    problem = OneStepProblem(mpc, clean.rows(), centre)
+    problem = OneStepProblem(mpc, clean.rows(), centre, noisy.coordinates)
     return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), smoothed_table, noise)
 
 
