@@ -22,6 +22,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
 
 from .one_step import OneStep
+from .plant import plant_rows
 
 logger = logging.getLogger(__name__)
 
@@ -228,8 +229,14 @@ def identify(
     Raises:
         InvalidDataError: If the data have other dimensions than the MPC.
     """
+    return identify_plant(mpc, plant_rows(mpc, table), config, seed=seed)
+
+
+def identify_plant(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+) -> Identification:
+    """As :func:`identify`, from a table of :func:`plant_rows`."""
     config = config or IdentificationConfig()
-    table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
     problem = OneStepProblem(mpc, _rows(mpc, table, config, rng), centre)
@@ -292,7 +299,7 @@ def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> A
 def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Rows:
     """A random subset in float64, small enough for its Jacobian."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
-    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
+    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * table.ny)))
     sample = table.sample(count, rng)
     columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)

@@ -16,11 +16,20 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .identification import Identification, IdentificationConfig, OneStepProblem, described, identify
+from .identification import (
+    Identification,
+    IdentificationConfig,
+    OneStepProblem,
+    described,
+    identify,
+    identify_plant,
+)
 from .kalman import Filtered, Linearised, filtered, smoothed
+from .plant import plant_rows, state_rows
 from .trajectories import Trajectories
 
 logger = logging.getLogger(__name__)
@@ -132,7 +141,7 @@ def estimate_noise(mpc: MPC, table: TransitionTable, theta: Array | None = None)
     """
     found = identify(mpc, table) if theta is None else None
     parameters, unwrapped = (found.theta, found.unwrapped) if found else (np.asarray(theta, np.float64), ())
-    return _noise(Trajectories.of(mpc, _excerpt(table, 0), unwrapped), parameters)
+    return _noise(Trajectories.of(mpc, _excerpt(plant_rows(mpc, table), 0), unwrapped), parameters)
 
 
 def smooth(
@@ -158,8 +167,17 @@ def smooth(
         InvalidArgumentError: For a noise estimate of another size.
         StorageError: Where a memory map cannot be written.
     """
-    if noise.measurement.shape != (mpc.nx,):
-        raise InvalidArgumentError("noise", expected=f"{mpc.nx} coordinates", actual=str(noise.measurement.shape))
+    n_states = mpc.layout.n_states
+    if noise.measurement.shape != (n_states,):
+        raise InvalidArgumentError("noise", expected=f"{n_states} coordinates", actual=str(noise.measurement.shape))
+    table = state_rows(mpc, table)
+    return with_plant_states(table, _smoothed_plant(mpc, plant_rows(mpc, table), theta, noise, unwrapped))
+
+
+def _smoothed_plant(
+    mpc: MPC, table: TransitionTable, theta: Array, noise: NoiseEstimate, unwrapped: tuple[int, ...]
+) -> TransitionTable:
+    """As :func:`smooth`, of what the plant's map is given."""
     parts = (table.take(slice(start, start + _CHUNK)) for start in range(0, len(table), _CHUNK))
     smooth_parts = (
         part.with_states(*_smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)) for part in parts
@@ -189,11 +207,13 @@ def identify_smoothed(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     config = config or IdentificationConfig()
-    first = identify(mpc, table, config, seed=seed)
+    whole = state_rows(mpc, table)
+    table = plant_rows(mpc, whole)
+    first = identify_plant(mpc, table, config, seed=seed)
     few = Trajectories.of(mpc, _excerpt(table, seed), first.unwrapped).thinned(_FEW_ROWS, seed)
     noise = _noise(few, first.theta)
     if noise.source == "unknown" or noise.negligible:
-        return SmoothedIdentification(first, table, noise)
+        return SmoothedIdentification(first, whole, noise)
     centre = table.centring.centre[: table.ny]
     coordinates = OneStepProblem(mpc, few.rows(), centre)
     z, information = coordinates.z(first.theta), np.zeros((0, 0))
@@ -209,12 +229,12 @@ def identify_smoothed(
     if not _likelihood(few, coordinates.theta(z), noise) <= _likelihood(few, first.theta, noise):
         z = coordinates.z(first.theta)
     logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
-    result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
+    result = _smoothed_plant(mpc, table, coordinates.theta(z), noise, first.unwrapped)
     clean = Trajectories.of(mpc, _excerpt(result, seed), first.unwrapped)
     identification = described(
         mpc, OneStepProblem(mpc, clean.rows(), centre), z, information, config.prior_spread, first.unwrapped
     )
-    return SmoothedIdentification(identification, result, noise)
+    return SmoothedIdentification(identification, with_plant_states(whole, result), noise)
 
 
 def _noise(problem: Trajectories, theta: Array) -> NoiseEstimate:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mpcoffline.core import limits
-from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.core.limits import check_limit
 from mpcoffline.core.types import Array
 
 from .component import Component, blocks_from_json
 from .expressions import function_from_json, function_to_json, traced
+from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
 
 Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
@@ -27,6 +26,9 @@ class Model(Component):
 
     An ODE is integrated with one RK4 step of length ``dt``, the input held.
 
+    Where inputs act late (``delay``), or their changes have a price, the model's state is z = [y, past inputs], y being
+    the observation (:class:`~mpcoffline.mpc.layout.Layout`); else it is y itself.
+
     Example:
         >>> def ode(x, u, p):
         ...     return ca.vertcat(x[1], (u[0] - p["c"] * x[1]) / p["m"])
@@ -35,15 +37,23 @@ class Model(Component):
     Args:
         dynamics: ``(x, u, p) -> dx/dt``, or ``-> x+`` with ``discrete=True``. ``x`` is ``(nx, 1)``, ``u`` is
             ``(nu, 1)``, ``p`` maps parameter names to CasADi matrices of their shapes.
-        nx: Number of model states (the policy's observation is the model state).
+        nx: Number of the plant's states (these are the policy's observation).
         nu: Number of inputs.
         dt: Sampling time in s.
         parameters: Numbers, arrays or :class:`Parameter`; what learning may change.
         discrete: Whether ``dynamics`` is already the discrete-time map.
+        delay: Dead time of the inputs in sampling steps, one number or one an input: the input of step k acts from step
+            k + delay on. None, the default, is not known: the learner looks for it in the data. 0 is known to be none.
+
+    Attributes:
+        layout: What z is made of.
+        delay: As given; one number an input where it is known.
+        plant: The plant's map (x, u, p) -> x+ as CasADi function, without dead time.
+        function: The map (z, u, p) -> z+, with it.
 
     Raises:
-        InvalidArgumentError: For non-positive sizes or ``dt``, or dynamics that return something of another shape or
-            that CasADi cannot evaluate symbolically.
+        InvalidArgumentError: For non-positive sizes or ``dt``, a negative delay or one of another length, or dynamics
+            that return something of another shape or that CasADi cannot evaluate symbolically.
     """
 
     def __init__(
@@ -55,26 +65,63 @@ class Model(Component):
         parameters: Mapping[str, Parameter | ArrayLike] | None = None,
         *,
         discrete: bool = False,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
-        _check_sizes(nx, nu)
+        layout = Layout.of(nx, nu, delay)
         if not (np.isfinite(dt) and dt > 0.0):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
-        self.nx, self.nu, self.dt = int(nx), int(nu), float(dt)
+        self.dt = float(dt)
         blocks = [Block.free(name, value, "model") for name, value in (parameters or {}).items()]
         self.space = ParameterSpace(blocks)
-        self.function = self._discretised(dynamics, discrete)
+        self.delay = None if delay is None else layout.delay
+        self._lay_out(layout, self._discretised(dynamics, layout, discrete))
 
-    def _discretised(self, dynamics: Dynamics, discrete: bool) -> ca.Function:
+    def _lay_out(self, layout: Layout, plant: ca.Function) -> None:
+        self.layout, self.plant, self.function = layout, plant, layout.wrapped(plant)
+
+    @property
+    def nx(self) -> int:
+        """Number of states: the size of z."""
+        return self.layout.nx
+
+    @property
+    def ny(self) -> int:
+        """Size of an observation; nx where there is no memory."""
+        return self.layout.ny
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return self.layout.nu
+
+    def with_delay(self, delay: int | Sequence[int] | None) -> Self:
+        """The same model with another dead time, see ``delay`` of the class; None where it is not known.
+
+        Raises:
+            InvalidArgumentError: For a negative delay, or one of another length.
+        """
+        other = copy.copy(self)
+        other._lay_out(self.layout.with_delay(delay), self.plant)
+        other.delay = None if delay is None else other.layout.delay
+        return other
+
+    def with_previous(self) -> Self:
+        """The same model with the inputs of the step before in its state, as prices on changes need them."""
+        other = copy.copy(self)
+        other._lay_out(self.layout.with_previous(), self.plant)
+        return other
+
+    def _discretised(self, dynamics: Dynamics, layout: Layout, discrete: bool) -> ca.Function:
         """The map (x, u, p) -> x+ as SX function, p being this model's flat parameter vector."""
-        x, u = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu)
+        x, u = ca.SX.sym("x", layout.n_states), ca.SX.sym("u", layout.nu)
         theta = ca.SX.sym("p", self.space.size)
         p = self.space.symbols(theta)
 
         def f(state: ca.SX) -> ca.SX:
             value = ca.densify(ca.SX(dynamics(state, u, p)))
-            if value.shape != (self.nx, 1):
+            if value.shape != (layout.n_states, 1):
                 raise InvalidArgumentError(
-                    "dynamics", expected=f"a column of {self.nx} expressions", actual=f"shape {value.shape}"
+                    "dynamics", expected=f"a column of {layout.n_states} expressions", actual=f"shape {value.shape}"
                 )
             return value
 
@@ -104,6 +151,8 @@ class Model(Component):
     def __call__(self, x: ArrayLike, u: ArrayLike) -> Array:
         """The successor states ``(..., nx)`` of x ``(..., nx)`` under u ``(..., nu)``, with the current parameters.
 
+        With dead time, x is z = [y, past inputs].
+
         Raises:
             InvalidArgumentError: For a last dimension other than nx or nu.
         """
@@ -120,10 +169,12 @@ class Model(Component):
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description; the function as a list of instructions."""
         return super().to_json() | {
-            "nx": self.nx,
+            "nx": self.layout.n_states,
             "nu": self.nu,
             "dt": self.dt,
-            "function": function_to_json(self.function),
+            "delay": None if self.delay is None else list(self.delay),
+            "previous": self.layout.has_previous,
+            "function": function_to_json(self.plant),
         }
 
     @classmethod
@@ -134,21 +185,16 @@ class Model(Component):
             FileFormatError: If the function is damaged or of other shapes.
         """
         model = cls.__new__(cls)
-        _check_sizes(data["nx"], data["nu"])
-        model.nx, model.nu, model.dt = data["nx"], data["nu"], float(data["dt"])
+        layout = Layout.of(data["nx"], data["nu"], data["delay"])
+        if data["previous"]:
+            layout = layout.with_previous()
+        model.dt, model.delay = float(data["dt"]), None if data["delay"] is None else layout.delay
         if not (np.isfinite(model.dt) and model.dt > 0.0):
             raise FileFormatError("model.dt", expected="a positive number of seconds", actual=str(data["dt"]))
         model.space = blocks_from_json(data)
-        sizes = (model.nx, model.nu, model.space.size)
-        model.function = function_from_json(data["function"], "model", inputs=sizes, output=model.nx)
+        sizes = (layout.n_states, layout.nu, model.space.size)
+        model._lay_out(layout, function_from_json(data["function"], "model", inputs=sizes, output=layout.n_states))
         return model
-
-
-def _check_sizes(nx: object, nu: object) -> None:
-    """Refuses numbers of states and inputs that are none, or more than can be solved with."""
-    check_integers(1, nx=nx, nu=nu)
-    for name, size, most in (("nx", nx, limits.STATES), ("nu", nu, limits.INPUTS)):
-        check_limit(name, "of them", int(str(size)), most, error=InvalidArgumentError)
 
 
 def rk4_expression(f: Callable[[ca.SX], ca.SX], x: ca.SX, dt: float) -> ca.SX:

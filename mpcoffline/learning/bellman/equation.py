@@ -40,6 +40,7 @@ class BellmanProblem:
 
     def __init__(self, mpc: MPC, value: ValueFunction, unit: float) -> None:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
+        self.n_states = mpc.layout.n_states
         self._value, self._discount, self.unit = value, mpc.discount, unit
 
     def discounted(self, batch: Columns) -> Tensor:
@@ -79,7 +80,7 @@ class BellmanProblem:
 
 
 class PredictionError:
-    """The one-step prediction error, every coordinate in the spread of its increments.
+    """The one-step prediction error of the plant's states, every coordinate in the spread of its increments.
 
     ::
 
@@ -97,8 +98,9 @@ class PredictionError:
     def __init__(self, problem: BellmanProblem, sample: Columns, theta: Tensor) -> None:
         self._problem = problem
         s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
+        s, reached = s[:, : problem.n_states], reached[:, : problem.n_states]
         with torch.no_grad():
-            missed = reached - problem.predicted(sample, theta)
+            missed = reached - problem.predicted(sample, theta)[:, : problem.n_states]
         rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
         spread = (torch.from_numpy(rows.reached) - s).std(dim=0, correction=0)
         self._scale = torch.where(spread > 0.0, spread, 1.0)
@@ -106,6 +108,7 @@ class PredictionError:
     def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean error over a minibatch, a scalar."""
         missed = batch.next_observations.double() - self._problem.predicted(batch, theta)
+        missed = missed[:, : self._problem.n_states]
         if self._angles:
             turns = torch.zeros_like(missed)
             angles = list(self._angles)

@@ -10,6 +10,7 @@ import numpy as np
 
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.plant import settled
 from mpcoffline.estimation.smoothing import identify_smoothed
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
@@ -144,7 +145,7 @@ def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
     kind = config.method
     if kind == "given":
         return known
-    goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
+    goal = settled(known.mpc, known.table)
     cost: TerminalCost = NormCost(goal)
     if kind != "norm":
         value, potential = known.constant_value, None if known.result is None else known.result.potential
