@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
 from . import contradictions, hypotheses
 from .findings import CHECKS, CheckReport, Excerpt, Finding
 
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
 for _name, _check in (
-    ("sizes", contradictions.sizes),
     ("alignment", contradictions.alignment),
     ("episodes", contradictions.episodes),
     ("costs", contradictions.costs),
@@ -33,7 +38,7 @@ _EXPLAINED_BY = {
 }
 
 
-def check(mpc: MPC, table: TransitionTable) -> CheckReport:
+def check(mpc: MPC, data: TransitionTable | MinariDataset | str) -> CheckReport:
     """Compares an MPC with a log: sizes, bounds, units, signs, order of columns, sampling time, rows out of step.
 
     Everything is compared with the model's own predictions, on about 2,000 rows from all over the log, its parameters
@@ -46,18 +51,23 @@ def check(mpc: MPC, table: TransitionTable) -> CheckReport:
 
     Args:
         mpc: MPC_1.
-        table: The log.
+        data: The log: a table, a Minari data set or the id of one.
 
     Returns:
         The findings, errors first.
+
+    Raises:
+        UnknownIdError: For an unknown data set id.
     """
-    excerpt = Excerpt.of(table)
+    table = TransitionTable.of(data)
     found: dict[str, list[Finding]] = {}
+    try:
+        excerpt = Excerpt.of(mpc, table)  # refuses other sizes, and episodes shorter than the dead time
+        table.check_fits(mpc.ny, mpc.nu, mpc.action_low, mpc.action_high)
+    except InvalidDataError as error:
+        return CheckReport((Finding(error.name, error.expected, error.actual, error.hint, "error"),))
     for name, look in CHECKS.items():
-        if any(found.get(cause) for cause in _EXPLAINED_BY.get(name, ())):
-            continue
-        found[name] = list(look(mpc, excerpt))
-        if name == "sizes" and any(each.name.endswith((": observations", ": actions")) for each in found[name]):
-            break  # nothing else can be compared
+        if not any(found.get(cause) for cause in _EXPLAINED_BY.get(name, ())):
+            found[name] = list(look(mpc, excerpt))
     every = [each for name in found for each in found[name]]
     return CheckReport(tuple(sorted(every, key=lambda each: each.kind != "error")))

@@ -9,10 +9,8 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.coordinates import Coordinates
 
 from .findings import Excerpt, Finding, nominal_costs, predicted
 from .units import FACTORS, OFFSETS, in_words
@@ -25,14 +23,6 @@ _NO_TESTS = 1e-3  # share of an input's spread that does not follow from the sta
 _SURE = 10.0  # standard errors
 _UNITS = 30.0  # times: more than any parameter is off
 _FAR = 3.0  # ranges of the data
-
-
-def sizes(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
-    """Sizes and input bounds."""
-    try:
-        log.table.check_fits(mpc.nx, mpc.nu, mpc.action_low, mpc.action_high)
-    except InvalidDataError as error:
-        yield Finding(error.name, error.expected, error.actual, error.hint, "error")
 
 
 def alignment(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
@@ -86,7 +76,7 @@ def costs(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
 
 def rewards(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     """Whether costs rise where the MPC's do."""
-    own = nominal_costs(mpc, log.x, log.u)
+    own = nominal_costs(mpc, log.z, log.a)
     use = np.isfinite(own) & ~log.ended
     if use.sum() < 2 * _FEW or np.ptp(own[use]) == 0.0 or np.ptp(log.cost[use]) == 0.0:
         return
@@ -117,9 +107,9 @@ def states(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
 
 def rows(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     """Whether there are as many numbers as parameters."""
-    n, n_parameters = len(log.table), sum(Coordinates(mpc, (group,)).size for group in ("cost", "model"))
-    if n * (mpc.nx + 1) < 3 * n_parameters:
-        expected = f"at least {-(-3 * n_parameters // (mpc.nx + 1))} rows for {n_parameters} parameters"
+    n, n_parameters = len(log.table), int(mpc.space.mask(("cost", "model")).sum())
+    if n * (mpc.ny + 1) < 3 * n_parameters:
+        expected = f"at least {-(-3 * n_parameters // (mpc.ny + 1))} rows for {n_parameters} parameters"
         hint = "Record more, or give fewer parameters (what is a plain number in the model is not learned)."
         yield Finding("rows", expected, str(n), hint)
 
@@ -135,7 +125,7 @@ def ranges(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
         for i in np.flatnonzero(matters & (low < high)).tolist():
             yield from _apart(f"observation {i}", "the reference", reference[i], reference[i], low[i], high[i])
     for bounds in mpc.state_bounds:
-        bottom, top = np.asarray(bounds.low), np.asarray(bounds.high)
+        bottom, top = (np.asarray(each)[: mpc.ny] for each in (bounds.low, bounds.high))
         for i in np.flatnonzero(np.isfinite(bottom) & np.isfinite(top) & (low < high)).tolist():
             yield from _apart(f"observation {i}", f"bounds {bounds.name!r}", bottom[i], top[i], low[i], high[i])
 
@@ -161,15 +151,12 @@ def _apart(name: str, what: str, bottom: float, top: float, low: float, high: fl
 
 
 def _matters(mpc: MPC, log: Excerpt) -> NDArray[np.bool_]:
-    """Which states the nominal stage cost looks at, ``(nx,)``."""
-    base = nominal_costs(mpc, log.x[:_FEW], log.u[:_FEW])
+    """Which states the nominal stage cost looks at, ``(n,)``."""
+    z, a = log.z[:_FEW], log.a[:_FEW]
+    base = nominal_costs(mpc, z, a)
     spread = np.ptp(log.x, axis=0)
-    found = []
-    for i in range(mpc.nx):
-        x = log.x[:_FEW].copy()
-        x[:, i] += spread[i]
-        found.append(bool((nominal_costs(mpc, x, log.u[:_FEW]) != base).any()))
-    return np.array(found)
+    moved = (z + size * (np.arange(z.shape[1]) == i) for i, size in enumerate(spread))
+    return np.array([bool((nominal_costs(mpc, each, a) != base).any()) for each in moved])
 
 
 def inputs(mpc: MPC, log: Excerpt) -> Iterator[Finding]:

@@ -15,6 +15,8 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
+from .plant import state_rows
+
 _ROWS, _BLOCK = 2_000, 100
 
 
@@ -90,16 +92,20 @@ class Excerpt:
 
     Attributes:
         table: The log.
-        x: Observations s, ``(m, nx)``.
-        u: Actions a, ``(m, nu)``.
+        z: The MPC's states, ``(m, nx)``: s, and past inputs where the MPC holds some.
+        a: Actions, ``(m, nu)``.
+        x: The plant's states, s, ``(m, n)``.
+        u: What acts on the plant: the actions, late by known dead times, ``(m, nu)``.
         cost: Costs, ``(m,)``.
-        reached: Observations s+, ``(m, nx)``.
+        reached: Observations s+, ``(m, n)``.
         ended: Whether the episode terminated there, ``(m,)``.
         adjacent: Whether a row and the next of the excerpt are neighbours in the log, ``(m - 1,)``.
         together: Whether they are of the same episode, too, ``(m - 1,)``.
     """
 
     table: TransitionTable
+    z: Array
+    a: Array
     x: Array
     u: Array
     cost: Array
@@ -109,18 +115,24 @@ class Excerpt:
     together: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, table: TransitionTable) -> Excerpt:
-        """At most 2,000 rows."""
-        n = len(table)
+    def of(cls, mpc: MPC, table: TransitionTable) -> Excerpt:
+        """At most 2,000 rows.
+
+        Raises:
+            InvalidDataError: If the data have other dimensions than the MPC, or no episode outlasts its dead time.
+        """
+        rows = state_rows(mpc, table)
+        n = len(rows)
         index = np.arange(n)
         if n > _ROWS:
             firsts = np.linspace(0, n - _BLOCK, _ROWS // _BLOCK).astype(np.intp)
             index = np.unique(firsts[:, None] + np.arange(_BLOCK))
-        c, ids = table.take(index).values(), np.asarray(table.episode_ids[index])
+        c, ids = rows.take(index).values(), np.asarray(rows.episode_ids[index])
         adjacent = np.diff(index) == 1
         together = adjacent & (ids[1:] == ids[:-1])
-        ended = np.asarray(c.terminations) > 0.0
-        return cls(table, c.observations, c.actions, c.costs, c.next_observations, ended, adjacent, together)
+        x, u = mpc.layout.split(c.observations, c.actions)
+        reached, ended = c.next_observations[:, : x.shape[1]], np.asarray(c.terminations) > 0.0
+        return cls(table, c.observations, c.actions, x, u, c.costs, reached, ended, adjacent, together)
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -133,12 +145,12 @@ CHECKS: Registry[Check] = Registry("check")
 
 
 def predicted(mpc: MPC, x: Array, u: Array) -> Array:
-    """The nominal model's f(x, u), ``(m, nx)``; not finite where the model is not."""
+    """The nominal model's f(x, u) of the plant's states, ``(m, n)``; not finite where the model is not."""
     with np.errstate(all="ignore"):
-        return np.asarray(mpc.dynamics_function(x.T, u.T, mpc.theta).full().T)
+        return np.asarray(mpc.plant_function(x.T, u.T, mpc.theta).full().T)
 
 
-def nominal_costs(mpc: MPC, x: Array, u: Array) -> Array:
-    """The nominal stage cost, ``(m,)``."""
+def nominal_costs(mpc: MPC, z: Array, a: Array) -> Array:
+    """The nominal stage cost of the MPC's states and inputs, ``(m,)``."""
     with np.errstate(all="ignore"):
-        return np.asarray(mpc.stage_function(x.T, u.T, mpc.theta).full().ravel())
+        return np.asarray(mpc.stage_function(z.T, a.T, mpc.theta).full().ravel())

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.integrators import Scheme
+from mpcoffline.mpc.scaling import increments_scale
 
 from .findings import Excerpt, Finding, nominal_costs
-from .identification import OneStepProblem, Rows, increments_scale, without_jumps
+from .identification import OneStepProblem, Rows, without_jumps
 from .units import FACTORS, OFFSETS, in_words
 
 _ROWS = 240
@@ -33,12 +35,14 @@ _NO_COST = 0.8  # of the costs' spread
 _GAIN = np.log(3.0)
 _WORSE = np.log(1.5)
 _FAR = 2.0  # scaled coordinates: parameters off by a factor 7
-_TRIED = 10
+_TRIED, _TRIED_HEAVY = 10, 2
 _PRIOR = 1e-3
-_ITERATIONS = 8
+_ITERATIONS, _ITERATIONS_HEAVY = 8, 4
+_HEAVY = 4_000  # instructions of the map, as of many substeps
 _MOST_PARAMETERS = 100
 _FAILED = 1e3
 _AS_MUCH = 0.3
+_LONGER = (2.0, 5.0, 10.0, 60.0, 100.0, 1e3, 3600.0)
 _LATE, _NO_LATER = 0.3, 0.1  # logarithms; right logs come to 0.1 and less
 _TINY = 1e-3
 
@@ -47,9 +51,9 @@ class Reading(NamedTuple):
     """Rows as they may have been meant.
 
     Attributes:
-        x: States, ``(m, nx)``.
+        x: States, ``(m, n)``.
         u: Inputs, ``(m, nu)``.
-        reached: States after them, ``(m, nx)``.
+        reached: States after them, ``(m, n)``.
         cost: Logged costs, ``(m,)``.
         u_next: Inputs of the rows after, ``(m, nu)``; NaN where there is none.
     """
@@ -79,8 +83,8 @@ class Judged(NamedTuple):
     """How well a reading is predicted.
 
     Attributes:
-        errors: Mean absolute errors in units of the motion, ``(nx + 1,)``; the last is the cost's.
-        floor: What a regression leaves; errors below it are no worse than it, ``(nx + 1,)``.
+        errors: Mean absolute errors in units of the motion, ``(n + 1,)``; the last is the cost's.
+        floor: What a regression leaves; errors below it are no worse than it, ``(n + 1,)``.
         moved: How far the parameters had to go, in scaled coordinates.
     """
 
@@ -90,22 +94,23 @@ class Judged(NamedTuple):
 
     @property
     def good(self) -> NDArray[np.bool_]:
-        """Which errors a rough model may have, ``(nx + 1,)``."""
+        """Which errors a rough model may have, ``(n + 1,)``."""
         return (self.errors <= _GOOD) | (self.errors <= _BESIDE_LINEAR * self.floor)
 
 
 def model(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     """Whether the log, read otherwise, is what the model predicts."""
     reading = _rows(log)
-    if len(reading.x) < max(_FEW, 5 * (mpc.nx + mpc.nu)):
+    if len(reading.x) < max(_FEW, 5 * (mpc.ny + mpc.nu)):
         return
     judge = _Judge(mpc, reading)
     plain = judge.identified(reading)
-    if plain.good[: mpc.nx].all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
+    if plain.good[: mpc.ny].all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
         yield from _late(judge, reading, plain)
         return
     guesses = _promising(judge, reading, _guesses(mpc))
     found = [(guess, judge.identified(guess.read(reading))) for guess in guesses]
+    found += [(_sampled(mpc.model.dt, k), _Judge(each, reading).identified(reading)) for k, each in _faster(mpc)]
     gains = [_gain(plain, judged) for _, judged in found]
     if gains and max(gains) > 0.0:
         # Of those that explain as much the one that changes least, and of these the one whose errors are smallest.
@@ -132,8 +137,8 @@ def _late(judge: _Judge, reading: Reading, plain: Judged) -> Iterator[Finding]:
     if ratio.sum() > _LATE and ratio.min() > -_NO_LATER:
         i = int(np.argmax(ratio))
         actual = (
-            f"actions of the row before: with each row's action taken from the next, the model leaves {found.errors[i]:.1%}"
-            f" of observation {i}'s motion unexplained instead of {plain.errors[i]:.1%}"
+            f"actions of the row before: with each row's action taken from the next, the model leaves"
+            f" {found.errors[i]:.1%} of observation {i}'s motion unexplained instead of {plain.errors[i]:.1%}"
         )
         hint = "The action of a row is what was applied from its s on, until its s+."
         yield Finding("actions", "actions of the same row", actual, hint)
@@ -155,7 +160,7 @@ def _gain(plain: Judged, found: Judged) -> float:
 def _finding(guess: Guess, plain: Judged, found: Judged, mpc: MPC) -> Finding:
     ratio = np.maximum(plain.errors, plain.floor) / np.maximum(found.errors, found.floor)
     i = int(np.argmax(ratio))
-    what = f"observation {i}'s motion" if i < mpc.nx else "the costs' spread, by the stage cost"
+    what = f"observation {i}'s motion" if i < mpc.ny else "the costs' spread, by the stage cost"
     if ratio[i] > 2.0:
         actual = (
             f"data of which the model, its parameters the best within their bounds, leaves {plain.errors[i]:.0%} of"
@@ -188,9 +193,11 @@ class _Judge:
         self._mpc = mpc
         self._problem = OneStepProblem(mpc, Rows(reading.x, reading.u, reading.reached))
         self._adapts = 0 < self._problem.free.size <= _MOST_PARAMETERS
+        heavy = mpc.plant_function.n_instructions() > _HEAVY
+        self.tried, self._iterations = (_TRIED_HEAVY, _ITERATIONS_HEAVY) if heavy else (_TRIED, _ITERATIONS)
 
     def nominal(self, readings: list[Reading]) -> list[Array]:
-        """Errors of many readings at theta_0, ``(nx + 1,)`` each: one call of the model."""
+        """Errors of many readings at theta_0, ``(n + 1,)`` each: one call of the model."""
         x, u = (np.concatenate([getattr(r, name) for r in readings]) for name in ("x", "u"))
         parts = np.split(self._problem.model.predict(x, u, self._mpc.theta), len(readings))
         return [
@@ -207,7 +214,7 @@ class _Judge:
         errors = problem.errors(self._mpc.theta)
         if self._adapts:
             try:
-                z = problem.descend(np.zeros(problem.free.size), _PRIOR, _ITERATIONS).z
+                z = problem.descend(np.zeros(problem.free.size), _PRIOR, self._iterations).z
             except InvalidDataError:  # the reading is none that the model can take
                 pass
             else:
@@ -232,7 +239,10 @@ class _Judge:
 
 def _cost_error(mpc: MPC, reading: Reading) -> float:
     """What the nominal stage cost leaves of the logged costs, in their mean absolute deviation; 0 for no evidence."""
-    own, cost = nominal_costs(mpc, reading.x, reading.u), reading.cost
+    cost = reading.cost
+    if not mpc.layout.is_plain:  # what is known of past inputs is not read otherwise
+        return 0.0
+    own = nominal_costs(mpc, reading.x, reading.u)
     if np.median(np.abs(cost - np.median(cost))) == 0.0:  # costs that hardly ever differ
         return 0.0
     if not np.isfinite(own).all() or np.ptp(own) == 0.0:
@@ -246,7 +256,7 @@ def _linear(rows: Rows, u: Array) -> Array:
     """What a regression of the motion on states and inputs, with squares and products if the rows allow, leaves of it.
 
     Returns:
-        In units of the motion, ``(nx,)``, as it would be on other rows.
+        In units of the motion, ``(n,)``, as it would be on other rows.
     """
     z = np.column_stack([rows.x, u])
     spread = z.std(axis=0)
@@ -270,13 +280,13 @@ def _promising(judge: _Judge, reading: Reading, guesses: list[Guess]) -> list[Gu
         float(np.log(np.maximum(error, _FLOOR)).mean()) if np.isfinite(read.reached).all() else np.inf
         for error, read in zip(errors, reads, strict=True)
     ]
-    chosen = np.sort(np.argsort(scores, kind="stable")[:_TRIED])
+    chosen = np.sort(np.argsort(scores, kind="stable")[: judge.tried])
     return [guesses[i] for i in chosen]
 
 
 def _guesses(mpc: MPC) -> list[Guess]:
     """All of them, the simplest first."""
-    nx, nu = mpc.nx, mpc.nu
+    nx, nu = mpc.ny, mpc.nu
     found = [*_signs(nx, nu), *_exchanges(nx, nu), *_sampling(mpc.model.dt)]
     single: list[_Columns] = [((i,), ()) for i in range(nx)] + [((), (j,)) for j in range(nu)]
     pairs: list[_Columns] = [(pair, ()) for pair in combinations(range(nx), 2)] if nx > 2 else []
@@ -359,11 +369,27 @@ def _exchanges(nx: int, nu: int) -> Iterator[Guess]:
 
 
 def _sampling(dt: float) -> Iterator[Guess]:
-    for factor in (2.0, 0.5, 5.0, 0.2, 10.0, 0.1, 60.0, 1.0 / 60.0, 100.0, 0.01, 1e3, 1e-3, 3600.0, 1.0 / 3600.0):
+    for factor in _LONGER:
+        yield _sampled(dt, factor)
+        yield _sampled(dt, 1.0 / factor)
 
-        def read(r: Reading, factor: float = factor) -> Reading:
-            return r._replace(reached=r.x + (r.reached - r.x) / factor)
 
-        words = f"the log's sampling time is about {factor * dt:.3g} s ({factor:.3g} times as long)"
-        hint = "Give the model the log's dt, in the unit of time of its equations."
-        yield Guess("dt", f"a log sampled every {dt:g} s, as the model says", words, hint, read)
+def _sampled(dt: float, factor: float) -> Guess:
+    def read(r: Reading) -> Reading:
+        return r._replace(reached=r.x + (r.reached - r.x) / factor)
+
+    words = f"the log's sampling time is about {factor * dt:.3g} s ({factor:.3g} times as long)"
+    hint = "Give the model the log's dt, in the unit of time of its equations."
+    return Guess("dt", f"a log sampled every {dt:g} s, as the model says", words, hint, read)
+
+
+def _faster(mpc: MPC) -> Iterator[tuple[float, MPC]]:
+    """The MPC with its equations over shorter sampling times: a long step of theirs is no multiple of a short one."""
+    model = mpc.model
+    if model.ode is None or model.scheme is None:
+        return
+    for factor in _LONGER:
+        shorter = copy.copy(model)
+        shorter.dt = model.dt / factor
+        substeps = 2 if model.scheme == Scheme("rk4") else 1  # another scheme, so that the map is made anew
+        yield 1.0 / factor, mpc.replace(model=shorter.with_scheme(Scheme("rk4", substeps)))
