@@ -115,6 +115,17 @@ def _symbols(mpc: MPC) -> tuple[ca.SX, ca.SX, ca.SX]:
     return ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
 
 
+def spread_of(values: NDArray[np.floating[Any]], rounding: float = 0.0) -> Array:
+    """The standard deviation of each column ``(d,)``; its size where it does not vary, and 1 where that is zero.
+
+    Args:
+        values: ``(n, d)``.
+        rounding: Share of its size below which a deviation is none.
+    """
+    spread, size = (np.asarray(v, dtype=np.float64) for v in (values.std(axis=0), np.abs(values).max(axis=0)))
+    return np.where(spread > rounding * size, spread, np.where(size > 0.0, size, 1.0))
+
+
 def cost_spread(costs: NDArray[np.floating[Any]]) -> float:
     """The standard deviation of costs ``(n,)``, the unit of whatever is compared with them; of one cost only, its size.
 
