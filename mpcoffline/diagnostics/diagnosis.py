@@ -87,8 +87,8 @@ def diagnose(
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
     table = TransitionTable.of(dataset)
     found = identify(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.with_theta(found.theta)
-    ensemble = Ensemble(nominal, clean, found, seed=seed)
+    clean, identified = found.table, nominal.replace(model=found.model)
+    ensemble = Ensemble(identified, clean, found, seed=seed)
     cost = LoggedCost(clean, seed)
     policies = MPCPolicy(nominal), MPCPolicy(learned)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW

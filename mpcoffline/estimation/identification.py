@@ -30,9 +30,8 @@ FULL_TURN = 2.0 * np.pi
 _NEAR_TURN = 0.5  # rad
 _AT_BOUND = 1e-4  # in scaled coordinates
 _WEAKEST_PRIOR = 1e-10
-_NOT_FINITE = 1e3  # what a prediction that is not finite counts, in spreads of the increments
+_ABSURD = 1e3  # spreads of the increments: what a prediction that is not finite counts; beyond, errors count by less
 _FEW_ROWS = 1_000  # for the way to the minimum
-_LARGEST = 1e150  # whose square is a float64
 _PRIOR_ROUNDS = 3  # until sigma^2, which begins at 1, is that of the minimum
 _MAX_ENTRIES = 20_000_000  # of the Jacobian: 160 MB
 
@@ -73,12 +72,13 @@ class OneStepIdentification:
         deviation: One standard deviation of each, given data and prior, with the episodes' own scatter: errors that
             last over many rows count as few; 0 where not identified, ``(size,)``.
         scale: Spread of the increments s+ - s, ``(nx,)``.
-        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``.
+        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``; a single one counts 1000 at most.
         errors_after: The same at theta.
         at_bound: Names of the parameters that ended at a bound.
         undetermined: Parameters, or combinations of them, that the data do not determine: moved to either side by as
             much as the prior leaves open, they predict the data as well. These stay near theta_0.
         unwrapped: Coordinates that proved to be wrapped angles.
+        absurd: Rows that the model predicts by more than 1000 spreads wrong, or not at all, and rows looked at.
     """
 
     theta: Array
@@ -89,6 +89,7 @@ class OneStepIdentification:
     at_bound: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
     unwrapped: tuple[int, ...] = ()
+    absurd: tuple[int, int] = (0, 0)
 
     @property
     def error_before(self) -> float:
@@ -109,6 +110,9 @@ class OneStepIdentification:
             logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", self.at_bound)
         if self.unwrapped:
             logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(self.unwrapped))
+        if self.absurd[0]:
+            text = "The model's predictions of %d of %d rows are absurd or not finite: is it right there, are the data?"
+            logger.warning(text, *self.absurd)
 
 
 class Rows(NamedTuple):
@@ -174,12 +178,19 @@ class OneStepProblem:
         return (predicted - self.rows.reached) / self.scale
 
     def linearised(self, z: Array) -> tuple[Array, Array]:
-        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall."""
+        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall.
+
+        Errors e beyond c = 1000 count c (1 + log(e / c)): a few absurd ones do not decide what the model is.
+        """
         predicted, slopes = self.model.with_slopes(self.rows.x, self.rows.u, self.theta(z))
         errors = (predicted - self.rows.reached) / self.scale
         jacobian = slopes[:, :, self.free] * self.slopes(z) / self.scale[:, None]
         finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
-        return np.where(finite, errors, _NOT_FINITE), np.where(finite[:, :, None], jacobian, 0.0)
+        errors, jacobian = np.where(finite, errors, _ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
+        beyond = np.maximum(np.abs(errors) / _ABSURD, 1.0)
+        if (beyond > 1.0).any():
+            errors, jacobian = errors * (1.0 + np.log(beyond)) / beyond, jacobian / beyond[:, :, None]
+        return errors, jacobian
 
     def descend(self, start: Array, prior: float, max_iterations: int) -> _Descent:
         """Trust-region Gauss-Newton from one start, within the bounds (scipy's ``trf``)."""
@@ -209,13 +220,17 @@ class OneStepProblem:
                 gtol=1e-12,
             )
         except (ValueError, np.linalg.LinAlgError) as error:  # squares of the derivative overflow
-            raise InvalidDataError(
-                "identification",
-                expected="data on which the model's prediction has finite derivatives",
-                actual=f"states up to {np.abs(self.rows.x).max():g} ({error})",
-                hint="Are the data in the model's units?",
-            ) from error
+            raise self.unpredictable(str(error)) from error
         return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
+
+    def unpredictable(self, reason: str) -> InvalidDataError:
+        """The error that says that the model makes nothing of the data."""
+        return InvalidDataError(
+            "identification",
+            expected="data that the model can predict",
+            actual=f"states up to {np.abs(self.rows.x).max():g} ({reason})",
+            hint="Are the data in the model's units?",
+        )
 
 
 def identify_one_step(
@@ -242,7 +257,7 @@ def identify_one_step(
         The identified parameters with their errors; theta_0 itself for a model without parameters.
 
     Raises:
-        InvalidDataError: If the data have other dimensions than the MPC.
+        InvalidDataError: If the data have other dimensions than the MPC, or the model predicts none of them at all.
     """
     config = config or IdentificationConfig()
     table.check_fits(mpc.nx, mpc.nu)
@@ -257,7 +272,10 @@ def identify_one_step(
         return described(mpc, problem, np.zeros(0), Misfit.nothing(), config.prior_spread, unwrapped)
     z, prior = _best_descent(problem, config, rng)
     variance = len(problem.rows.x) * prior * config.prior_spread**2
-    return described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
+    found = described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
+    if found.absurd[0] == len(rows.x):
+        raise problem.unpredictable("the best prediction of every row is more than 1000 increments off")
+    return found
 
 
 def _misfit(problem: OneStepProblem, z: Array, variance: float, episodes: NDArray[np.integer[Any]]) -> Misfit:
@@ -286,6 +304,8 @@ def described(
         unwrapped: Coordinates that are wrapped angles.
     """
     theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
+    errors = problem.errors(theta)
+    absurd = int(np.sum(~(np.abs(errors) <= _ABSURD).all(axis=1)))
     covariance, undetermined = uncertainty(misfit, z, (problem.low, problem.high), spread, problem.names)
     deviation = np.zeros_like(theta)
     identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
@@ -295,10 +315,11 @@ def described(
         deviation,
         problem.scale,
         _root_mean_square(problem.errors(mpc.theta)),
-        _root_mean_square(problem.errors(theta)),
+        _root_mean_square(errors),
         tuple(name for name, bound in zip(problem.names, _at_bound(problem, z), strict=True) if bound),
         undetermined,
         unwrapped,
+        (absurd, len(errors)),
     )
 
 
@@ -361,5 +382,5 @@ def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
 
 def _root_mean_square(errors: Array) -> Array:
     """Of each coordinate ``(nx,)``, whatever the model predicts."""
-    finite = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_LARGEST, neginf=-_LARGEST)
-    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_LARGEST, _LARGEST) ** 2, axis=0)))
+    finite = np.nan_to_num(errors, nan=_ABSURD, posinf=_ABSURD, neginf=-_ABSURD)
+    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_ABSURD, _ABSURD) ** 2, axis=0)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, Model
 
 from .identification import (
     IdentificationConfig,
@@ -46,10 +46,12 @@ class Identification(OneStepIdentification):
     Attributes:
         table: The smoothed data; the given table itself where its noise is negligible.
         noise: The noise found.
+        model: The identified model, integrated as accurately as the log asks for.
     """
 
     table: TransitionTable
     noise: NoiseEstimate
+    model: Model
 
 
 def identify(
@@ -65,6 +67,10 @@ def identify(
     the data most likely under the extended Kalman filter, by Gauss-Newton on its innovations (Ljung, "System
     Identification", ch. 7: a prediction-error method), noise and model estimated in turn.
 
+    A model that takes its substeps from the log (``integrator="auto"``) may need more at what is identified than at
+    theta_0; then all is done again, from theta_0, with as many: a coarse Runge-Kutta step has the same one-step error
+    at another, wrong time constant, and the data would seem sure of it.
+
     Args:
         mpc: The MPC; its parameters are theta_0, and all but those of the model stay as they are.
         table: The transitions, in the order of time within each episode. Rows that were left out are gaps.
@@ -78,23 +84,39 @@ def identify(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     config = config or IdentificationConfig()
+    mpc = mpc.replace(model=mpc.model.suited_to_log(table))
+    for _ in range(_ROUNDS):
+        found = _identified(mpc, table, config, seed)
+        model = found.model.suited_to_log(table, finer=True)
+        if model.scheme == found.model.scheme:
+            break
+        logger.info("Identified again: at what was found, %s is not accurate, %s is.", found.model.scheme, model.scheme)
+        mpc = mpc.replace(model=model.with_theta(mpc.model.space.theta))
+    found.warn()
+    return found
+
+
+def _identified(mpc: MPC, table: TransitionTable, config: IdentificationConfig, seed: int) -> Identification:
+    """As :func:`identify`, with the model integrated as it is."""
+
+    def result(found: OneStepIdentification, table: TransitionTable, noise: NoiseEstimate) -> Identification:
+        model = mpc.with_theta(found.theta).model
+        return Identification(**vars(found), table=table, noise=noise, model=model)
+
     first = identify_one_step(mpc, table, config, seed=seed)
     source = excerpt(table, seed)
     few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)
     if noise.source == "unknown" or noise.negligible:
-        first.warn()
-        return Identification(**vars(first), table=table, noise=noise)
+        return result(first, table, noise)
     z, noise, misfit = _most_likely(mpc, few, first, config, (table, source))
     logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
     centre = table.centring.centre[: table.ny]
     noisy = OneStepProblem(mpc, few.rows(), centre)
-    result = smooth(mpc, table, noisy.theta(z), noise, unwrapped=first.unwrapped)
-    clean = Trajectories.of(mpc, excerpt(result, seed), first.unwrapped)
+    smoothed_table = smooth(mpc, table, noisy.theta(z), noise, unwrapped=first.unwrapped)
+    clean = Trajectories.of(mpc, excerpt(smoothed_table, seed), first.unwrapped)
     problem = OneStepProblem(mpc, clean.rows(), centre, noisy.coordinates)
-    found = described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped)
-    found.warn()
-    return Identification(**vars(found), table=result, noise=noise)
+    return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), smoothed_table, noise)
 
 
 def _most_likely(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mpcoffline.learning import Bellman, Method, ParameterConfig, StartConfig, TerminalConfig, ValueConfig
+from mpcoffline.learning import Bellman, CostConfig, Method, ParameterConfig, StartConfig, TerminalConfig, ValueConfig
 
 _DEFAULT = Bellman(
     least_discount=0.95,
     horizon=30,
+    # What the user wrote is used as it is where the logged costs are just that.
+    cost=CostConfig("auto"),
     # A model that cannot become the plant is adapted to what (FIT) needs of it; one that predicts well is left alone:
     # models of the wrong structure missed 13 % of an increment in the study, right ones less than 1 %, noise or not.
     identify=StartConfig(init="identified", adapt_above=0.03),

@@ -8,6 +8,7 @@ from torch import Tensor
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.estimation.identification import FULL_TURN, Rows, without_jumps
+from mpcoffline.learning.stages import KnownCost
 from mpcoffline.learning.value.fit import ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.scaling import increments_scale
@@ -28,11 +29,13 @@ class BellmanProblem:
         mpc: The MPC whose functions f and Lhat are fitted.
         value: V_phi, constant here.
         unit: What errors are measured in, the spread of the cost.
+        cost: How L follows from Lhat, where that is known: then ``scale Lhat`` stands for Lhat here.
     """
 
-    def __init__(self, mpc: MPC, value: ValueFunction, unit: float) -> None:
+    def __init__(self, mpc: MPC, value: ValueFunction, unit: float, cost: KnownCost | None = None) -> None:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
         self._value, self._discount, self.unit = value, mpc.discount, unit
+        self._scale = 1.0 if cost is None else cost.scale
 
     def discounted(self, batch: Columns) -> Tensor:
         """The weight of what follows, ``(B,)``: gamma, and zero after a terminal state."""
@@ -58,7 +61,7 @@ class BellmanProblem:
     def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:
         """Lhat_th(s,a), ``(B,)``."""
         cost: Tensor = self._stage(batch.observations.double(), batch.actions.double(), theta)
-        return cost.squeeze(-1)
+        return self._scale * cost.squeeze(-1)
 
     def error(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean squared error over a minibatch, a scalar."""

@@ -56,7 +56,7 @@ def identified(known: Known, config: StartConfig) -> Known:
     found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    mpc = known.mpc.with_theta(found.theta)
+    mpc = known.mpc.replace(model=found.model)
     return replace(known, mpc=mpc, table=found.table, model_error=found.error_after)
 
 
@@ -97,8 +97,9 @@ class LearnParameters(Stage):
     def begin(self, known: Known) -> Training:
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
-        mpc, config = in_units_of(known.mpc, known.table), self._adapting(known.model_error)
-        return ParameterTraining(mpc, known.constant_value, known.table, known.groups, config, seed=known.seed)
+        mpc = known.mpc if known.cost is not None else in_units_of(known.mpc, known.table)
+        value, config = known.constant_value, self._adapting(known.model_error)
+        return ParameterTraining(mpc, value, known.table, known.groups, config, seed=known.seed, cost=known.cost)
 
     def _adapting(self, missed: float | None) -> ParameterConfig:
         """The configuration, without steps on a model that was identified and predicts well."""
@@ -155,9 +156,10 @@ def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
         _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")
     elif config.method != "norm":
         value, potential = known.constant_value, None if known.result is None else known.result.potential
+        scale = 1.0 if known.cost is None else known.cost.scale
         cost = fit_terminal(
             "quadratic" if config.method == "quadratic" else "network",
-            value if potential is None else lambda s: value(s) - potential(s),
+            lambda s: (value(s) if potential is None else value(s) - potential(s)) / scale,
             known.table.sample(_TERMINAL_ROWS, 0).observations,
             x_ref=goal,
             blend=config.blend,
