@@ -135,3 +135,34 @@ def test_a_parameter_that_starts_at_zero_is_found(start: Any) -> None:
     found = identify(mpc, table)
     assert not found.undetermined
     assert float(mpc.with_theta(found.theta).values["model.b"]) == pytest.approx(truth, rel=1e-5)
+
+
+def closed_loop(units: Units, mpc: MPC, table: TransitionTable) -> float:
+    """The true cost of the spring's mass under what is learned in other units, in the old ones."""
+    schedule = {"value_n_steps": 500, "hidden": (32,), "value_batch_size": 128, "horizon": 15}
+    learner = OfflineMPCLearner(units.mpc(mpc), seed=0, **schedule)
+    learner.fit(units.table(table), show_progress=False)
+    x, total, plan = np.random.default_rng(1).uniform([-2.0, -1.0], [2.0, 1.0], (20, 2)), 0.0, None
+    for _ in range(40):
+        u, plan = learner.policy.predict(x * units.states, state=plan)
+        u = u[:, 0].astype(float) / float(np.asarray(units.inputs))
+        total += float(np.mean((x[:, 0] - 0.4) ** 2 + 0.1 * x[:, 1] ** 2 + 0.1 * u**2))
+        for _ in range(5):
+            x = x + 0.02 * np.column_stack([x[:, 1], u - 0.4 * x[:, 1] - 0.5 * np.sin(x[:, 0]) + 0.3])
+    return total
+
+
+@pytest.mark.slow
+def test_the_closed_loop_is_the_same_in_any_units() -> None:
+    mpc, table = spring_mpc(), spring_log()
+    spread = float(table.costs.std())
+    others = [
+        Units(cost=1e-6),
+        Units(cost=1e6),
+        Units(offset=1e6 * spread),
+        Units(offset=-1e6 * spread),
+        Units([1e6, 1e-6], 1e-6),
+        Units([1e-6, 1e6], 1e6, cost=1e-6, offset=-1e3 * spread),
+    ]
+    costs = [closed_loop(units, mpc, table) for units in (Units(), *others)]
+    np.testing.assert_allclose(costs[1:], costs[0], rtol=0.01)
