@@ -88,11 +88,15 @@ def learned(units: Units, mpc: MPC, table: TransitionTable, preset: str, **optio
 @pytest.mark.parametrize("preset", ["paper", "default"])
 @pytest.mark.parametrize("name", ["spring", *TASKS])
 def test_powers_of_two_change_no_bit(name: str, preset: str) -> None:
-    """Rounding does not depend on them: theta, V and terminal cost are the same numbers."""
+    """Rounding does not depend on them: theta, V and the terminal cost from it are the same numbers."""
     mpc, table = problem(name)
     units = Units(powers(mpc.nx, 0), powers(mpc.nu, 1), cost=4.0**-7)
     before, after = learned(Units(), mpc, table, preset), learned(units, mpc, table, preset)
-    assert before.differences(after) == dict.fromkeys(vars(before), 0.0)
+    differences = before.differences(after)
+    terminal = differences.pop("terminal")
+    assert differences == dict.fromkeys(differences, 0.0)
+    if preset == "default":  # the tasks' own one is a norm, whose unit nobody can change
+        assert terminal == 0.0 or (name == "linear" and terminal < 1e-9)  # the Riccati equation's solver balances
 
 
 @pytest.mark.parametrize("units", [Units(cost=4.0**9), Units([2.0**-15, 2.0**9], 2.0**12)], ids=["cost", "states"])
