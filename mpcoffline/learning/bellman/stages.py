@@ -11,6 +11,7 @@ import numpy as np
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import identify
+from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
@@ -149,7 +150,7 @@ def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
     """
     if config.method == "given":
         return known
-    goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
+    goal = settled(known.mpc, known.table)
     exact = riccati_cost(known.mpc) if config.method == "auto" else None
     cost: TerminalCost = NormCost(goal) if exact is None else exact
     if exact is not None:
