@@ -12,8 +12,8 @@ from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation import Identification, identify
 from mpcoffline.estimation.plant import settled
-from mpcoffline.estimation.smoothing import SmoothedIdentification, identify_smoothed
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
@@ -91,9 +91,9 @@ def diagnose(
     if nominal.layout.delay != learned.layout.delay:  # of the dead time that the learner has found
         nominal = nominal.with_delay(learned.layout.delay)
     table = with_memory(TransitionTable.of(dataset), learned.layout)
-    found = identify_smoothed(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.with_theta(found.identification.theta)
-    ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
+    found = identify(nominal, table, seed=seed)
+    clean, identified = found.table, nominal.replace(model=found.model)
+    ensemble = Ensemble(identified, clean, found, seed=seed)
     cost = LoggedCost(clean, seed, None if learned.layout.has_previous else learned.ny)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
     starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
@@ -112,7 +112,7 @@ def diagnose(
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
         weights=weight_checks(nominal, learned),
-        at_bounds=bound_names(learned, nominal),
+        at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
         lag=lag,
         noise=found.noise,
@@ -130,9 +130,9 @@ def diagnose(
     return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
 
 
-def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:
+def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:
     before, best, after = (one_step_error(mpc, found.table) for mpc in (nominal, identified, learned))
-    return PredictionCheck(before, best, after, found.identification.undetermined)
+    return PredictionCheck(before, best, after, found.undetermined)
 
 
 def _theorem(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from .delays import DelaySearch, find_delays
-from .identification import Identification, IdentificationConfig, identify
-from .smoothing import NoiseEstimate, estimate_noise, identify_smoothed, smooth, with_measurement_noise
+from .identification import IdentificationConfig
+from .identifying import Identification, identify
+from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
 
 __all__ = [
     "DelaySearch",
@@ -14,7 +15,6 @@ __all__ = [
     "estimate_noise",
     "find_delays",
     "identify",
-    "identify_smoothed",
     "smooth",
     "with_measurement_noise",
 ]

@@ -93,6 +93,7 @@ class MPC:
         object.__setattr__(self, "action_high", high)
         object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
         _ = self.stage_function, self.terminal_function  # dimensions are refused here, not at the first solve
+        object.__setattr__(self, "model", self.model.suited_to(self._rest(), self._extreme_inputs()))
 
     def _bounds(self, name: str) -> Array:
         bounds = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))
@@ -163,6 +164,25 @@ class MPC:
                 return values[name][: self.ny]
         return None
 
+    def _rest(self) -> Array:
+        """The reference; zero where there is none."""
+        return np.zeros(self.ny) if self.reference is None else self.reference
+
+    def _extreme_inputs(self) -> Array:
+        """The input at rest, and with one input after another on its bounds, ``(1 + 2 nu, nu)``.
+
+        One without bounds is moved by its own size, by 1 where that is zero.
+        """
+        low, high = np.asarray(self.action_low), np.asarray(self.action_high)
+        rest = self.values.get("stage_cost.u_ref", np.zeros(0))
+        with np.errstate(invalid="ignore"):
+            middle = np.nan_to_num((low + high) / 2.0, posinf=0.0, neginf=0.0)
+        rest = np.clip(rest if rest.shape == (self.nu,) else middle, low, high)
+        size = np.where(rest == 0.0, 1.0, np.abs(rest))
+        ends = np.where(np.isfinite(low), low, rest - size), np.where(np.isfinite(high), high, rest + size)
+        moved = [np.where(np.arange(self.nu) == i, end, rest) for end in ends for i in range(self.nu)]
+        return np.stack([rest, *moved])
+
     @property
     def usual_input(self) -> Array:
         """What counts as applied before anything is known, ``(nu,)``: the stage cost's ``u_ref``, else 0, in bounds."""
@@ -223,23 +243,7 @@ class MPC:
             UnknownIdError: For a name that no parameter has.
             InvalidArgumentError: For a wrong shape, a matrix that is not PSD, or a value out of bounds.
         """
-        n = self.horizon
-        shapes = {block.name: block.shape for block in self.space}
-        along: dict[str, Array] = {}
-        for name, value in values.items():
-            array, shape = np.asarray(value, dtype=np.float64), shapes.get(name, np.shape(value))
-            if array.shape == (n, *shape):
-                array = np.concatenate([array, array[-1:]])
-            elif array.shape == shape:
-                array = np.broadcast_to(array, (n + 1, *shape))
-            if array.shape != (n + 1, *shape):
-                raise InvalidArgumentError(
-                    name, expected=f"shape {shape}, {(n, *shape)} or {(n + 1, *shape)}", actual=f"shape {array.shape}"
-                )
-            along[name] = array
-        return np.stack([self.space.pack({name: array[k] for name, array in along.items()}) for k in range(n + 1)])[
-            None
-        ]
+        return self.space.along(values, self.horizon)[None]
 
     def with_delay(self, delay: int | Sequence[int] | None) -> Self:
         """The same problem with another dead time, see :class:`Model`.
@@ -315,12 +319,7 @@ class MPC:
     @property
     def state_bounds(self) -> list[StateBounds]:
         """The bounds of x_1 ... x_N, on z; past inputs have none."""
-        given, free = [c for c in self._constraints if isinstance(c, StateBounds)], np.full(self.nx - self.ny, np.inf)
-        if not free.size:
-            return given
-        return [
-            replace(c, low=np.append(np.asarray(c.low), -free), high=np.append(np.asarray(c.high), free)) for c in given
-        ]
+        return [c.padded(self.nx - self.ny) for c in self._constraints if isinstance(c, StateBounds)]
 
     @property
     def _constraints(self) -> tuple[Constraint | StateBounds, ...]:
