@@ -82,7 +82,7 @@ def _ramps(x: ca.SX, grid: Array) -> ca.SX:
         ramp = (x - low) / (high - low)
         ramp = ca.fmax(ramp, 0.0) if k > 0 else ramp
         ramps.append(ca.fmin(ramp, 1.0) if k < len(grid) - 2 else ramp)
-    return cast(ca.SX, ca.vertcat(*ramps))
+    return ca.vertcat(*ramps)
 
 
 def _basis(x: ca.SX, knots: Array, degree: int) -> ca.SX:
