@@ -11,7 +11,7 @@ from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.smoothing import SmoothedIdentification, identify_smoothed
+from mpcoffline.estimation import Identification, identify
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
@@ -86,9 +86,9 @@ def diagnose(
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
     table = TransitionTable.of(dataset)
-    found = identify_smoothed(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.with_theta(found.identification.theta)
-    ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
+    found = identify(nominal, table, seed=seed)
+    clean, identified = found.table, nominal.replace(model=found.model)
+    ensemble = Ensemble(identified, clean, found, seed=seed)
     cost = LoggedCost(clean, seed)
     policies = MPCPolicy(nominal), MPCPolicy(learned)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
@@ -108,7 +108,7 @@ def diagnose(
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
         weights=weight_checks(nominal, learned),
-        at_bounds=bound_names(learned, nominal),
+        at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
         lag=lag,
         noise=found.noise,
@@ -126,9 +126,9 @@ def diagnose(
     return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
 
 
-def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:
+def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:
     before, best, after = (one_step_error(mpc, found.table) for mpc in (nominal, identified, learned))
-    return PredictionCheck(before, best, after, found.identification.undetermined)
+    return PredictionCheck(before, best, after, found.undetermined)
 
 
 def _theorem(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 import scipy.spatial
@@ -13,12 +12,11 @@ import torch
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman.equation import BellmanProblem, variance_of
+from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
-from mpcoffline.mpc.parameters import Group
+from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale
 
 _ROWS = 10_000
 _TREE_ROWS = 5_000
@@ -54,6 +52,8 @@ class ValueCheck:
 @dataclass(frozen=True)
 class RegionError:
     """The regression error of (FIT) in one part of the data, in units of the cost's variance.
+
+    A constant that the error has in all data does not count: it is a constant of the cost, which changes no input.
 
     Attributes:
         name: The part, by quantiles of V.
@@ -133,7 +133,7 @@ def fit_errors(
     """
     sample = table.sample(_ROWS, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
-    unit = variance_of(sample.costs)
+    unit = cost_spread(sample.costs)
     before, after = (
         _residuals(BellmanProblem(mpc, value, unit), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)
@@ -145,6 +145,7 @@ def fit_errors(
             reached = model.predicted(columns, torch.from_numpy(learned.theta))
             shaping = potential(columns.observations) - model.discounted(columns) * potential(reached)
         after = after - shaping.double().numpy()
+    before, after = before - before.mean(), after - after.mean()
     values = value.predict(sample.observations)
     edges = np.quantile(values, np.linspace(0.0, 1.0, _REGIONS + 1))
     parts = {"all data": np.ones(len(values), dtype=bool)}
@@ -152,7 +153,7 @@ def fit_errors(
         name = ("V lowest quarter", "V second quarter", "V third quarter", "V highest quarter")[k]
         parts[name] = (values >= edges[k]) & (values <= edges[k + 1])
     return tuple(
-        RegionError(name, float(np.mean(before[part] ** 2) / unit), float(np.mean(after[part] ** 2) / unit))
+        RegionError(name, *(float(np.mean((missed[part] / unit) ** 2)) for missed in (before, after)))
         for name, part in parts.items()
     )
 
@@ -245,8 +246,10 @@ def goal_share(table: TransitionTable, reference: Array) -> float:
     return float(np.mean((np.abs(table.observations - reference) < _NEAR * scale).all(axis=1)))
 
 
-def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
+def bound_names(mpc: MPC, nominal: MPC, table: TransitionTable) -> tuple[str, ...]:
     """Parameters on a bound that were not on it before; the zeros of a matrix factor's diagonal are no bounds."""
     before, after = (dict(zip(m.space.names, m.theta, strict=True)) for m in (nominal, mpc))
-    on_bounds = Coordinates(mpc, get_args(Group)).at_bounds(mpc.theta)
+    s, a, costs, reached, _ = table.sample(_ROWS, 4).values()
+    scaling = Scaling.of(s, a, costs, reached, table.centring.centre[: table.ny])
+    on_bounds = Coordinates(mpc, ("cost", "model"), scaling).at_bounds(mpc.theta)
     return tuple(name for name in on_bounds if before.get(name) != after[name])

@@ -16,8 +16,9 @@ _DEFAULT = Bellman(
     identify=StartConfig(init="identified", adapt_above=0.03),
     value=ValueConfig(method="auto", tau=0.1, n_steps=3_000, learning_rate=2e-3, polyak=None),
     fit=ParameterConfig(n_steps=200, prediction_weight=0.1),
-    # Half of it is a convex quadratic: a network alone has local minima, to which short plans fall.
-    terminal=TerminalConfig(method="network", blend=0.5),
+    # Half of it is a convex quadratic: a network alone has local minima, to which short plans fall. None is needed
+    # where the learned MPC is linear-quadratic.
+    terminal=TerminalConfig(method="auto", blend=0.5),
 )
 
 PRESETS: dict[str, Method] = {

@@ -59,7 +59,7 @@ class Run:
         start.table.check_fits(mpc.nx, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
         _check_device(start.device)
         self.method, self._start = method, start
-        self._mpc = method.restructured(mpc)
+        self._mpc = method.restructured(mpc.replace(model=mpc.model.suited_to_log(start.table)))
         _check_discount(start.value_function, self._mpc.discount)
         self._outcome: Callable[[], Known] | None = None
         self.value_function = start.value_function

@@ -18,6 +18,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.scaling import Scaling
 
 from .stages import Known, KnownCost
 
@@ -191,10 +192,12 @@ def _explained(inputs: Array, residual: Array) -> float:
 
 def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     """The MPC with the cost parameters that are nearest to the logged costs; None where there are none."""
-    coordinates = Coordinates(mpc, ("cost",))
+    few = table.sample(4_000, 0)
+    columns, centre = few.values(), table.centring.centre[: table.ny]
+    scaling = Scaling.of(columns.observations, columns.actions, columns.costs, columns.next_observations, centre)
+    coordinates = Coordinates(mpc, ("cost",), scaling)
     if coordinates.size == 0:
         return None
-    few = table.sample(4_000, 0)
     _, logged, inputs, _ = _costs(mpc, few)
     s, a, size = inputs[:, : mpc.nx].T, inputs[:, mpc.nx :].T, float(logged.std())
     if not size > 0.0:

@@ -17,6 +17,7 @@ from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
+from .linear_quadratic import is_linear_quadratic
 from .stages import Change, Stage
 
 _log = logging.getLogger(__name__)
@@ -42,7 +43,8 @@ class Method(ABC):
     Attributes:
         trim: Share of the transitions that is learned from; the farthest out are left out.
         discount: gamma of V and of the learned MPC; None keeps the given MPC's.
-        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken.
+        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken: a small discount hides
+            goals that are far. A linear-quadratic MPC, which sees any distance, keeps its own.
         horizon: N of the learned MPC; None keeps the given one's, or what ``least_horizon`` makes of it.
         least_horizon: Where ``horizon`` is None, a horizon that leaves more to V, and is faster: this one at
             ``least_discount``, and where the discount is larger as many steps as it takes for gamma^N to fall as low,
@@ -147,7 +149,8 @@ class Method(ABC):
 
     def restructured(self, nominal: MPC) -> MPC:
         """The MPC with the discount, the horizon and the form of stage cost that the options ask for."""
-        discount = max(nominal.discount, self.least_discount) if self.discount is None else self.discount
+        least = 0.0 if is_linear_quadratic(nominal) else self.least_discount
+        discount = max(nominal.discount, least) if self.discount is None else self.discount
         mpc = nominal.replace(discount=discount, horizon=self._horizon(nominal.horizon, discount))
         cost = nominal.stage_cost
         if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:

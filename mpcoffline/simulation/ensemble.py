@@ -10,7 +10,7 @@ import torch
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import Identification, OneStepProblem, Rows, without_jumps
+from mpcoffline.estimation.identification import OneStepIdentification, OneStepProblem, Rows, without_jumps
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
@@ -56,7 +56,7 @@ class Ensemble:
         self,
         mpc: MPC,
         table: TransitionTable,
-        identification: Identification,
+        identification: OneStepIdentification,
         *,
         n_perturbed: int = 5,
         n_residual: int = 5,
@@ -111,7 +111,7 @@ class _Episodes:
         return Rows(*(part[chosen] for part in rows))
 
 
-def _problem_of(mpc: MPC, table: TransitionTable, identification: Identification) -> OneStepProblem:
+def _problem_of(mpc: MPC, table: TransitionTable, identification: OneStepIdentification) -> OneStepProblem:
     """One-step prediction on the whole table, wrapped angles without jumps."""
     columns = table.values()
     rows = Rows(columns.observations, columns.actions, columns.next_observations)

@@ -18,8 +18,9 @@ from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale
 
-from .equation import BellmanProblem, PredictionError, variance_of
+from .equation import BellmanProblem, PredictionError
 from .refit import refit_cost
 
 _log = logging.getLogger(__name__)
@@ -105,10 +106,13 @@ class ParameterTraining:
         if len(costs) > 1 and np.ptp(costs) == 0.0 and cost is None:
             _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
         self._rng = np.random.default_rng(seed)
-        self._problem = BellmanProblem(mpc, value, variance_of(costs), cost)
+        self._problem = BellmanProblem(mpc, value, cost_spread(costs), cost)
         self._sample = table.columns(torch.from_numpy(table.sample(config.refit_rows, self._rng).rows))
-        self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))
-        self._coordinates = Coordinates(mpc, groups)
+        s, a, _, reached, _ = (part.double().numpy() for part in self._sample)
+        centre = table.centring.centre[: table.ny]
+        self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta), centre)
+        self._scaling = Scaling(s, a, increments_scale(s, reached, centre), self._problem.unit)
+        self._coordinates = Coordinates(mpc, groups, self._scaling)
         with torch.no_grad():
             self._loss_before = float(self._problem.error(self._sample, torch.from_numpy(mpc.theta)))
         if not np.isfinite(self._loss_before):
@@ -223,6 +227,7 @@ class ParameterTraining:
             theta,
             self._problem,
             self._sample,
+            self._scaling,
             prior=config.prior,
             shaped=config.potential,
             max_iterations=config.refit_iterations,
