@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
+from mpcoffline.learning.ends import innermost
 from mpcoffline.learning.stages import Arrays, Change
 from mpcoffline.mpc import MPC
 
@@ -77,7 +78,8 @@ class Run:
             InvalidDataError: If the data do not fit.
             MPCOfflineError: If a regression fails.
         """
-        known = replace(self._start, mpc=self._mpc, table=self._start.table.trim(self.method.trim))
+        table = innermost(self._start.table, self.method.trim, self._mpc.discount)
+        known = replace(self._start, mpc=self._mpc, table=table, given=self._start.mpc)
         stages, total = list(self.method.stages().items()), 0
         while stages:
             (name, stage), *stages = stages
