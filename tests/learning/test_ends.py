@@ -98,8 +98,8 @@ def test_a_terminal_network_holds_the_ends_too() -> None:
     T = fit_terminal("network", lambda s: torch.zeros(len(s)), inside, x_ref=[0.0], seed=0, ends=ends)
     x = ca.SX.sym("x")
     value = ca.Function("T", [x], [T.terminal_expression(x, T.space.symbols(ca.DM(T.space.theta)))])
-    assert value(np.linspace(-0.9, 0.9, 50)[None]).full() == pytest.approx(0.0, abs=1.0)
-    assert value(outside.T).full() == pytest.approx(10.0, abs=1.5)
+    assert value(np.linspace(-0.9, 0.9, 50)[None]).full() == pytest.approx(0.0, abs=1.5)
+    assert (value(outside.T).full() > 5.0).all()
 
 
 def test_from_a_bonus_for_being_alive_the_model_alone_is_learned(caplog: pytest.LogCaptureFixture) -> None:
