@@ -12,6 +12,7 @@ from mpcoffline.core.checks import check_integers, check_known, check_number
 from .methods import VALUE_METHODS, ValueMethod, check_tau, method_from_json, method_to_json
 
 SWEEPS = 3.0  # times 1 / (1 - gamma): how often the target must have followed
+_LEAST_SWEEPS = 1.5  # the same for a rate that is not given: a faster one costs stability
 _POLYAK = (0.02, 0.2)  # the slowest and the fastest of a rate that is not given
 
 
@@ -67,8 +68,13 @@ class ValueConfig:
         """
         if self.polyak is not None:
             return self.polyak
-        needed = SWEEPS / max(self.n_steps * (1.0 - discount), 1e-12)
-        return min(max(needed * (1.0 - 1e-9), _POLYAK[0]), _POLYAK[1])
+        needed = _LEAST_SWEEPS / max(self.n_steps * (1.0 - discount), 1e-12)
+        return min(max(needed, _POLYAK[0]), _POLYAK[1])
+
+    def settles(self, discount: float) -> bool:
+        """Whether the target follows often enough."""
+        sweeps = self.rate(discount) * self.n_steps * (1.0 - discount)
+        return sweeps >= (1.0 - 1e-9) * (_LEAST_SWEEPS if self.polyak is None else SWEEPS)
 
     def build(self, *, noisy: bool = False) -> ValueMethod:
         """The loss.

@@ -208,12 +208,11 @@ def _tell(method: ValueMethod, found: Stochasticity | None, config: ValueConfig,
             100.0 * found.cost,
         )
     polyak = config.rate(discount)
-    sweeps = polyak * config.n_steps * (1.0 - discount)
-    if sweeps < SWEEPS * (1.0 - 1e-9) and discount < 1.0 and not isinstance(method, Residual):
+    if not config.settles(discount) and discount < 1.0 and not isinstance(method, Residual):
         _log.warning(
             "(VALUE) may end before V has settled: polyak * n_steps * (1 - discount) is %.2g, below %g; raise n_steps "
             "(%d) or polyak (%g)",
-            sweeps,
+            polyak * config.n_steps * (1.0 - discount),
             SWEEPS,
             config.n_steps,
             polyak,
