@@ -78,12 +78,11 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
             100.0 * found.agreeing,
         )
     if found.constant:
-        _log.warning(
-            "%s: the logged cost is %g in every transition that does not end an episode: it says when episodes end, "
-            "but not what is better before; stage and terminal cost stay the given ones, and the model is learned",
-            known.table.name,
-            found.offset,
-        )
+        says = "all costs are %g, so they do not tell what is good"
+        if np.asarray(known.table.terminations).any():
+            says = "the costs are %g until an episode ends: they say when that is, but not what is better before"
+        kept = "; stage and terminal cost stay the given ones, and the model is learned"
+        _log.warning("%s: " + says + kept, known.table.name, found.offset)
     return replace(known, cost=found)
 
 

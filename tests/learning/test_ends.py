@@ -73,8 +73,8 @@ def test_ends_matter_where_they_have_a_price(
 def test_no_end_is_left_out_where_it_matters() -> None:
     """Ends are the rows that are farthest out."""
     priced, free = walks(-1.0, 0.0), walks(1.0, 1.2, varied=1.0)
-    assert innermost(priced, 0.8, 0.95).terminations.sum() == priced.terminations.sum()
-    kept = innermost(free, 0.8, 0.95)
+    assert innermost(priced, 0.8, 0.95, priced.ny).terminations.sum() == priced.terminations.sum()
+    kept = innermost(free, 0.8, 0.95, free.ny)
     assert len(kept) == pytest.approx(0.8 * len(free), abs=1)
     assert kept.terminations.sum() < free.terminations.sum()
 
