@@ -19,8 +19,10 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
+from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
+from .plant import plant_rows
 from .uncertainty import Misfit, clusters, uncertainty
 
 logger = logging.getLogger(__name__)
@@ -139,14 +141,17 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: Rows, centre: Array | float = 0.0) -> None:
-        self.coordinates = c = Coordinates(mpc, ("model",))
+    def __init__(
+        self, mpc: MPC, rows: Rows, centre: Array | float = 0.0, coordinates: Coordinates | None = None
+    ) -> None:
+        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
+        c = coordinates or Coordinates(mpc, ("model",), Scaling(rows.x, rows.u, self.scale))
+        self.coordinates = c
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
         self.names = [names[i] for i in self.free]
-        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
@@ -257,8 +262,14 @@ def identify_one_step(
     Raises:
         InvalidDataError: If the data have other dimensions than the MPC, or the model predicts none of them at all.
     """
+    return identify_plant(mpc, plant_rows(mpc, table), config, seed=seed)
+
+
+def identify_plant(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+) -> OneStepIdentification:
+    """As :func:`identify_one_step`, from a table of :func:`plant_rows`."""
     config = config or IdentificationConfig()
-    table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
     rows, episodes = _rows(mpc, table, config, rng)
@@ -321,25 +332,12 @@ def described(
     )
 
 
-def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> Array:
-    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1.
-
-    Args:
-        x: States, ``(n, nx)``.
-        reached: Those after them, ``(n, nx)``.
-        centre: What the table that they are from was packed without, ``(nx,)``: it was not rounded to float32.
-    """
-    spread = (reached - x).std(axis=0)
-    rounding, least = (1e-6 * np.abs(x - offset).max(axis=0) for offset in (centre, 0.0))
-    return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
-
-
 def _rows(
     mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator
 ) -> tuple[Rows, NDArray[np.integer[Any]]]:
     """A random subset in float64, small enough for its Jacobian, and the episode of each row."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
-    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
+    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * table.ny)))
     sample = table.sample(count, rng)
     columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)

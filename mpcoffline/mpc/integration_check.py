@@ -11,7 +11,8 @@ import numpy as np
 from mpcoffline.core.types import Array
 
 from .integrators import Scheme
-from .substeps import Choice, Flow, choice_on, relative, spread_of
+from .scaling import increments_scale
+from .substeps import Choice, Flow, choice_on, relative
 
 ROWS = 2_000  # of a log that are looked at
 _FINER = 4  # times as many substeps, at least _FINEST, are taken for the truth
@@ -81,12 +82,12 @@ def checked(
         rows: The log.
         fixed: Whether the scheme is what the user asked for.
     """
-    x, u, reached = sampled(rows)
+    x, u, reached = sampled(rows, flow.n_states)
     known = flow.defined(x, u)
     x, u, reached = x[known], u[known], reached[known]
     exact = scheme.kind == "exact"
     truth = flow.exact(x, u) if exact else flow(x, u, max(_FINER * scheme.substeps, _FINEST))
-    errors = relative(step(x, u) - truth, spread_of(x, reached)) if len(x) else np.zeros(1)
+    errors = relative(step(x, u) - truth, increments_scale(x, reached)) if len(x) else np.zeros(1)
     typical, largest = (float(np.quantile(errors, q, method="higher")) for q in (0.99, 1.0))
     advice = "" if exact else _advice(choice_on(flow, x, u, reached), scheme, fixed=fixed)
     if not known.all():
@@ -94,11 +95,14 @@ def checked(
     return IntegrationCheck(scheme.kind, 1 if exact else scheme.substeps, typical, largest, len(x), advice)
 
 
-def sampled(rows: Rows) -> tuple[Array, Array, Array]:
-    """States, inputs and the states after them of some of the rows, float64."""
+def sampled(rows: Rows, n_states: int) -> tuple[Array, Array, Array]:
+    """The plant's states ``(n, n_states)``, inputs and the states after them of some of the rows, float64.
+
+    Inputs that act late are taken as they are: they come from the same range.
+    """
     few = rows.sample(ROWS, 0)
     x, u, reached = (np.asarray(v, np.float64) for v in (few.observations, few.actions, few.next_observations))
-    return x, u, reached
+    return x[:, :n_states], u, reached[:, :n_states]
 
 
 def _advice(choice: Choice, scheme: Scheme, *, fixed: bool) -> str:

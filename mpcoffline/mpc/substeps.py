@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 
 from .integrators import MOST_SUBSTEPS, rk4_expression
+from .scaling import increments_scale
 
 _TYPICAL, _WORST = 0.02, 0.2  # errors of a step that may be, in increments
 _QUANTILE = 0.99
@@ -78,6 +79,11 @@ class Flow:
         self._slope = ca.Function("slope", [x, u, p], [ca.densify(ca.jacobian(ode(x, u, p), x))])
 
     @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.ode.numel_in(0))
+
+    @property
     def most(self) -> int:
         """As many substeps as a solver can be compiled with."""
         return int(np.clip(_MOST_OPERATIONS // max(1, self._substep.n_instructions()), 1, MOST_SUBSTEPS))
@@ -125,7 +131,7 @@ def choice_on(flow: Flow, x: Array, u: Array, reached: Array, least: int = 1) ->
     if not known.any():
         return Choice(least)
     x, u, reached = x[known], u[known], reached[known]
-    spread, coarse = spread_of(x, reached), {least: flow(x, u, least)}
+    spread, coarse = increments_scale(x, reached), {least: flow(x, u, least)}
 
     def compared(n: int) -> Doubling:
         coarse[2 * n] = flow(x, u, 2 * n)
@@ -209,12 +215,6 @@ def _doubled(compared: Callable[[int], Doubling], least: int, most: int) -> Choi
     if smallest <= 1.0:
         return Choice(tried[-1].substeps)
     return Choice(next(one.substeps for one in tried if one.excess <= _NEAR * smallest), reason)
-
-
-def spread_of(x: Array, reached: Array) -> Array:
-    """Spread of the increments ``(nx,)``; of the states themselves where nothing moves, else 1."""
-    spread, rounding = (reached - x).std(axis=0), 1e-6 * np.abs(x).max(axis=0)
-    return np.where(spread > rounding, spread, np.where(rounding > 0.0, x.std(axis=0) + rounding, 1.0))
 
 
 def relative(errors: Array, size: Array) -> Array:

@@ -17,11 +17,13 @@ from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import SOLVERS, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
+from mpcoffline.solvers.scaling import cost_constant, input_units
 from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
 from mpcoffline.solvers.status import Stats, Status
 
 from .build import compiled
 from .codegen import source
+from .rounding import Rounding
 
 _STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE)  # by the kernel's codes
 _LANES = 8
@@ -35,6 +37,7 @@ class _Problem(ctypes.Structure):
         ("discount", c_double),
         ("low", c_void_p),
         ("high", c_void_p),
+        ("unit", c_void_p),
         ("max_iterations", c_int64),
         ("tolerance", c_double),
     )
@@ -53,6 +56,7 @@ class _Batch(ctypes.Structure):
         ("u", c_void_p),
         ("J", c_void_p),
         ("predicted", c_void_p),
+        ("size", c_void_p),  # NULL, as here: nobody asks
         ("iterations", c_void_p),
         ("status", c_void_p),
         ("guess", c_int),  # 0, as here: a plan that need not obey the model
@@ -77,16 +81,20 @@ class DDPSolver(Solver):
     plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
     Otherwise it is the best plan found, and ``status`` says why it was not accepted: ``"iteration limit"``,
-    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one; most often a kink: ``fmax``,
-    ``fabs``, ``if_else``), or ``"not finite"``.
+    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), or ``"not finite"``.
+
+    Slopes that jump or are infinite (``fmax``, ``fabs``, ``if_else``, saturations, dead zones, ``sqrt`` or ``v**0.8``
+    at 0) stop a method that follows them. What is not solved because of them is solved with the corners rounded over
+    1 % of each quantity's range, and again exactly from there; the better plan of the exact model is returned, and it
+    counts as solved if the rounded problem was. The first time, the log says which corners there are.
 
     References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 
     Args:
         mpc: The problem; without constraints other than input bounds.
         max_iterations: Bound on the iterations of a problem.
-        tolerance: Predicted decrease of the cost, relative to ``1 + |V|``, below which a problem is solved; 1000 times
-            as much where the iterations are used up.
+        tolerance: Predicted decrease of the cost, relative to the magnitudes of its stages (their constants left out),
+            below which a problem is solved; 1000 times as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
         n_threads: Threads that share a batch; a batch of up to eight problems uses one.
 
@@ -122,14 +130,24 @@ class DDPSolver(Solver):
         library.mpc_solve_cold.argtypes = (problem, batch, c_void_p, c_int64, c_int64, c_int64, c_int64)
         self._library = library
         self._low, self._high = (np.ascontiguousarray(b, dtype=np.float64) for b in (mpc.action_low, mpc.action_high))
+        self._unit = input_units(mpc)
         self._problem = _Problem(
-            mpc.horizon, mpc.discount, self._low.ctypes.data, self._high.ctypes.data, max_iterations, tolerance
+            mpc.horizon,
+            mpc.discount,
+            self._low.ctypes.data,
+            self._high.ctypes.data,
+            self._unit.ctypes.data,
+            max_iterations,
+            tolerance,
         )
+        self._constant = cost_constant(mpc)
+        self._own_constant = float(self._constant(self._theta))
         compared = n_starts if is_convex(mpc) else N_CANDIDATES  # any start leads to the only minimum
         self._candidates = np.ascontiguousarray(candidate_inputs(mpc)[:compared])
         self._starts = _address(self._candidates), len(self._candidates), n_starts
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
+        self._rounding: Rounding | None = None
 
     @classmethod
     def refuses(cls, mpc: MPC) -> str:
@@ -138,7 +156,9 @@ class DDPSolver(Solver):
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
-        result = self._run(x, theta, u0, None) if warm_start is None else self._run_warm(x, theta, u0, warm_start)
+        result = self.run(x, theta, u0, warm_start)
+        if np.count_nonzero(result["status"]):
+            self._rounded().improve(self, x, theta, u0, result)
         status = result["status"]
         stats: Stats = {
             "iterations": result["iterations"],
@@ -147,7 +167,32 @@ class DDPSolver(Solver):
             "all_starts": result.get("all_starts", warm_start is None),
         }
         ended = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
-        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], status == 0, ended, stats)
+        value = result["J"]
+        if theta is not self._theta:
+            value = value + self._constant(theta.T).full()[0]
+        elif self._own_constant:
+            value = value + self._own_constant
+        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], value, status == 0, ended, stats)
+
+    def _rounded(self) -> Rounding:
+        """What solves the problem where its corners stand in the way; made when it is first needed."""
+        if self._rounding is None:
+
+            def make(mpc: MPC) -> DDPSolver:
+                return DDPSolver(
+                    mpc,
+                    max_iterations=self.max_iterations,
+                    tolerance=self.tolerance,
+                    n_starts=self.n_starts,
+                    n_threads=self._n_threads,
+                )
+
+            self._rounding = Rounding(self.mpc, make)
+        return self._rounding
+
+    def run(self, x: Array, theta: Array, u0: Array | None, plan: Plan | None) -> dict[str, NDArray[Any]]:
+        """Solves problems as they are: warm from a plan, cold without; see :class:`Rounding` for what it returns."""
+        return self._run(x, theta, u0, None) if plan is None else self._run_warm(x, theta, u0, plan)
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""
