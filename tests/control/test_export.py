@@ -54,7 +54,7 @@ def mpc_of(case: str) -> MPC:
             1,
             0.05,
             {"L": 0.02},
-            integrator="rk4:8",
+            integrator="rk4:16",
         )
         reference = [1.0, 0.0, np.sqrt(9.81)]
         cost = QuadraticCost(np.eye(3), [[0.1]], x_ref=reference, u_ref=[2.0 * reference[2]])
