@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -12,20 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.places import warn_once
 from mpcoffline.core.types import Array
 
 from .component import Component, blocks_from_json
-from .expressions import function_from_json, function_to_json, traced
+from .expressions import function_from_json, function_to_json, is_affine, traced
 from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfall
-from .integrators import Scheme, exact_scheme, integrated, is_affine, is_short
+from .integrators import Scheme, exact_scheme, integrated, is_short
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
-from .substeps import Flow, choice_from, choice_on
+from .substeps import Choice, Flow, choice_from, choice_on
 from .torch_import import TorchExpression
 
 Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
-
-logger = logging.getLogger(__name__)
 
 
 class Model(Component):
@@ -261,8 +259,6 @@ class Model(Component):
     def suited_to(self, start: Array, inputs: Array) -> Model:
         """The model with the substeps that ``integrator="auto"`` takes before there is a log; itself once it has some.
 
-        Warns where no number of substeps is enough.
-
         Args:
             start: A state that matters, as the reference, ``(nx,)``.
             inputs: Inputs that may be applied, ``(m, nu)``.
@@ -271,9 +267,7 @@ class Model(Component):
             return self
         flow = Flow(self.ode, self.dt, self.space.theta)
         choice = choice_from(flow, start, inputs)
-        if not choice.enough:
-            logger.warning("A step of %g s of the model is not accurate: %s", self.dt, shortfall(choice))
-        return self.with_scheme(Scheme("rk4", choice.substeps))
+        return self._with_substeps(choice, "with the inputs that may be applied")
 
     def suited_to_log(self, table: Rows, *, finer: bool = False) -> Model:
         """The model with the substeps that ``integrator="auto"`` takes on a log; itself where another was asked for.
@@ -288,6 +282,12 @@ class Model(Component):
             return self.with_scheme(exact_scheme(self.ode, self.dt, self.space.theta, self.scheme))
         flow = Flow(self.ode, self.dt, self.space.theta)
         choice = choice_on(flow, *sampled(table, self.layout.n_states), self.scheme.substeps if finer else 1)
+        return self._with_substeps(choice, "on this log")
+
+    def _with_substeps(self, choice: Choice, where: str) -> Model:
+        """The model with what was chosen; warns, once, where that is not enough."""
+        if advice := shortfall(choice):
+            warn_once(f"A step of {self.dt:g} s of the model {self!r} is not accurate {where}: {advice}")
         return self.with_scheme(Scheme("rk4", choice.substeps))
 
     def check(self, table: Rows) -> IntegrationCheck:
