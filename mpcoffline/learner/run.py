@@ -109,7 +109,7 @@ class Run:
         """What the stages begin with: past inputs beside the observations where the MPC holds some, then trimmed."""
         known = self.method.prepared(replace(self._start, mpc=self._mpc))
         table = with_memory(known.table, known.mpc.layout)
-        return replace(known, table=table.trim(self.method.trim, known.mpc.ny))
+        return replace(known, table=table.trim(self.method.trim, known.mpc.layout.n_states))
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

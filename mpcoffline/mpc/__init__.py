@@ -11,6 +11,7 @@ from .model import Model
 from .networks import ConvexNetworkCost, NetworkCost
 from .parameters import Block, Parameter, ParameterSpace
 from .problem import MPC
+from .signals import Signal
 
 __all__ = [
     "CONSTRAINTS",
@@ -29,6 +30,7 @@ __all__ = [
     "ParameterSpace",
     "Penalty",
     "QuadraticCost",
+    "Signal",
     "StageCost",
     "StateBounds",
     "TerminalCost",
