@@ -67,5 +67,5 @@ class Bellman(Method):
             "identify": partial(identified, config=self.identify),
             "value": LearnValue(self.value),
             "fit": LearnParameters(self.fit, self.identify.adapt_above),
-            "terminal": partial(with_terminal_cost, config=self.terminal),
+            "terminal": partial(with_terminal_cost, config=self.terminal, horizon=self.horizon),
         }
