@@ -12,6 +12,7 @@ from .model import Model
 from .networks import ConvexNetworkCost, NetworkCost
 from .parameters import Block, Parameter, ParameterSpace
 from .problem import MPC
+from .signals import Signal
 
 __all__ = [
     "CONSTRAINTS",
@@ -31,6 +32,7 @@ __all__ = [
     "ParameterSpace",
     "Penalty",
     "QuadraticCost",
+    "Signal",
     "StageCost",
     "StateBounds",
     "TerminalCost",

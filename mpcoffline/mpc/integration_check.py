@@ -11,6 +11,7 @@ import numpy as np
 from mpcoffline.core.types import Array
 
 from .integrators import Scheme
+from .layout import Layout
 from .scaling import increments_scale
 from .substeps import Choice, Flow, choice_on, relative
 
@@ -71,7 +72,7 @@ class IntegrationCheck:
 
 
 def checked(
-    flow: Flow, scheme: Scheme, step: Callable[[Array, Array], Array], rows: Rows, *, fixed: bool
+    flow: Flow, scheme: Scheme, step: Callable[[Array, Array], Array], rows: Rows, layout: Layout, *, fixed: bool
 ) -> IntegrationCheck:
     """Measures the error of one step against a much finer one; of an affine ODE against scipy's ``expm``.
 
@@ -80,9 +81,10 @@ def checked(
         scheme: How it is integrated.
         step: The step ``(x, u) -> x+`` for many states.
         rows: The log.
+        layout: What its columns are.
         fixed: Whether the scheme is what the user asked for.
     """
-    x, u, reached = sampled(rows, flow.n_states)
+    x, u, reached = sampled(rows, layout)
     known = flow.defined(x, u)
     x, u, reached = x[known], u[known], reached[known]
     exact = scheme.kind == "exact"
@@ -95,14 +97,15 @@ def checked(
     return IntegrationCheck(scheme.kind, 1 if exact else scheme.substeps, typical, largest, len(x), advice)
 
 
-def sampled(rows: Rows, n_states: int) -> tuple[Array, Array, Array]:
-    """The plant's states ``(n, n_states)``, inputs and the states after them of some of the rows, float64.
+def sampled(rows: Rows, layout: Layout) -> tuple[Array, Array, Array]:
+    """The plant's states, inputs with present signals beside them, and the states after them of some of the rows.
 
     Inputs that act late are taken as they are: they come from the same range.
     """
     few = rows.sample(ROWS, 0)
     x, u, reached = (np.asarray(v, np.float64) for v in (few.observations, few.actions, few.next_observations))
-    return x[:, :n_states], u, reached[:, :n_states]
+    n = layout.n_states
+    return x[:, :n], np.hstack([u, x[:, layout.present]]), reached[:, :n]
 
 
 def _advice(choice: Choice, scheme: Scheme, *, fixed: bool) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -20,10 +21,11 @@ from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfa
 from .integrators import Scheme, exact_scheme, integrated, is_short
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
+from .signals import Signal
 from .substeps import Choice, Flow, choice_from, choice_on
 from .torch_import import TorchExpression
 
-Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
+Dynamics = Callable[..., ca.SX]  # (x, u, p) or, with signals, (x, u, p, d)
 
 
 class Model(Component):
@@ -52,6 +54,8 @@ class Model(Component):
         discrete: Whether ``dynamics`` is already the discrete-time map.
         integrator: ``"auto"``; ``"exact"``, for an ODE that is affine in (x, u); ``"rk4"``, one Runge-Kutta step a
             sampling time; ``"rk4:N"``, N of them.
+        signals: What comes from outside: :class:`Signal` columns of the observation after the plant's states. Dynamics
+            that take a fourth argument get their present values by name, ``(x, u, p, d)`` with ``d.price``.
         delay: Dead time of the inputs in sampling steps, one number or one an input: the input of step k acts from step
             k + delay on. None, the default, is not known: the learner looks for it in the data. 0 is known to be none.
 
@@ -82,8 +86,9 @@ class Model(Component):
         discrete: bool = False,
         integrator: str = "auto",
         delay: int | Sequence[int] | None = None,
+        signals: Sequence[Signal] = (),
     ) -> None:
-        layout = Layout.of(nx, nu, delay)
+        layout = Layout.of(nx, nu, delay, signals)
         if not (np.isfinite(dt) and dt > 0.0):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
         if discrete and integrator != "auto":
@@ -205,11 +210,12 @@ class Model(Component):
         return Scheme("rk4")
 
     def _traced(self, dynamics: Dynamics) -> ca.Function:
-        """What the user wrote as SX function (x, u, p), p being this model's flat parameter vector."""
-        x, u = ca.SX.sym("x", self.layout.n_states), ca.SX.sym("u", self.nu)
+        """What the user wrote as SX function (x, [u, d], p), p being this model's flat parameter vector."""
+        x, u = ca.SX.sym("x", self.layout.n_states), ca.SX.sym("u", len(self.layout.acting))
         theta = ca.SX.sym("p", self.space.size)
+        outside = [self.layout.named(u[self.nu :])] if _takes_signals(dynamics) else []
         try:
-            value = ca.densify(ca.SX(dynamics(x, u, self.space.symbols(theta))))
+            value = ca.densify(ca.SX(dynamics(x, u[: self.nu], self.space.symbols(theta), *outside)))
             if value.shape != (self.layout.n_states, 1):
                 raise InvalidArgumentError(
                     "dynamics",
@@ -260,8 +266,8 @@ class Model(Component):
         """The model with the substeps that ``integrator="auto"`` takes before there is a log; itself once it has some.
 
         Args:
-            start: A state that matters, as the reference, ``(nx,)``.
-            inputs: Inputs that may be applied, ``(m, nu)``.
+            start: A state that matters, as the reference, ``(n_states,)``.
+            inputs: Inputs that may be applied, with usual signals beside them, ``(m, nu + n_signals)``.
         """
         if self.settled or self.ode is None:
             return self
@@ -281,7 +287,7 @@ class Model(Component):
         if self.scheme.kind == "exact":
             return self.with_scheme(exact_scheme(self.ode, self.dt, self.space.theta, self.scheme))
         flow = Flow(self.ode, self.dt, self.space.theta)
-        choice = choice_on(flow, *sampled(table, self.layout.n_states), self.scheme.substeps if finer else 1)
+        choice = choice_on(flow, *sampled(table, self.layout), self.scheme.substeps if finer else 1)
         return self._with_substeps(choice, "on this log")
 
     def _with_substeps(self, choice: Choice, where: str) -> Model:
@@ -299,7 +305,7 @@ class Model(Component):
         if self.ode is None or self.scheme is None:
             return IntegrationCheck("map", 1, 0.0, 0.0, 0, "")
         flow, fixed = Flow(self.ode, self.dt, self.space.theta), self.integrator != "auto"
-        return checked(flow, self.scheme, self._plant_step, table, fixed=fixed)
+        return checked(flow, self.scheme, self._plant_step, table, self.layout, fixed=fixed)
 
     def _plant_step(self, x: Array, u: Array) -> Array:
         """The plant's states ``(B, n_states)`` after x, u acting."""
@@ -338,6 +344,7 @@ class Model(Component):
             "settled": self.settled,
             "delay": None if self.delay is None else list(self.delay),
             "previous": self.layout.has_previous,
+            "signals": [signal.to_json() for signal in self.layout.signals],
             "function": function_to_json(self.plant if self.ode is None else self.ode),
         }
 
@@ -349,14 +356,14 @@ class Model(Component):
             FileFormatError: If the function is damaged or of other shapes, or its integrator is none or not for it.
         """
         model = cls.__new__(cls)
-        layout = Layout.of(data["nx"], data["nu"], data["delay"])
+        layout = Layout.of(data["nx"], data["nu"], data["delay"], [Signal.from_json(s) for s in data["signals"]])
         if data["previous"]:
             layout = layout.with_previous()
         model.dt, model.delay = float(data["dt"]), None if data["delay"] is None else layout.delay
         if not (np.isfinite(model.dt) and model.dt > 0.0):
             raise FileFormatError("model.dt", expected="a positive number of seconds", actual=str(data["dt"]))
         model.space = blocks_from_json(data)
-        sizes = (layout.n_states, layout.nu, model.space.size)
+        sizes = (layout.n_states, len(layout.acting), model.space.size)
         function = function_from_json(data["function"], "model", inputs=sizes, output=layout.n_states)
         integrator, scheme = data["integrator"], None
         if integrator != "map":
@@ -368,3 +375,13 @@ class Model(Component):
         model.layout = layout
         model._take(function, integrator, scheme, settled=data["settled"] is True)
         return model
+
+
+def _takes_signals(dynamics: Callable[..., Any]) -> bool:
+    """Whether a function of the user takes signals as its fourth argument."""
+    try:
+        parameters = inspect.signature(dynamics).parameters.values()
+    except (TypeError, ValueError):  # of what is built in
+        return False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters) >= 4
