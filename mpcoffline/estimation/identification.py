@@ -22,6 +22,7 @@ from mpcoffline.mpc.coordinates import Coordinates
 from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
+from .plant import plant_rows
 from .uncertainty import Misfit, clusters, uncertainty
 
 logger = logging.getLogger(__name__)
@@ -259,8 +260,14 @@ def identify_one_step(
     Raises:
         InvalidDataError: If the data have other dimensions than the MPC, or the model predicts none of them at all.
     """
+    return identify_plant(mpc, plant_rows(mpc, table), config, seed=seed)
+
+
+def identify_plant(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+) -> OneStepIdentification:
+    """As :func:`identify_one_step`, from a table of :func:`plant_rows`."""
     config = config or IdentificationConfig()
-    table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
     rows, episodes = _rows(mpc, table, config, rng)
@@ -328,7 +335,7 @@ def _rows(
 ) -> tuple[Rows, NDArray[np.integer[Any]]]:
     """A random subset in float64, small enough for its Jacobian, and the episode of each row."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
-    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
+    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * table.ny)))
     sample = table.sample(count, rng)
     columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)

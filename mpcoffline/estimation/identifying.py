@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC, Model
 
@@ -16,16 +17,17 @@ from .identification import (
     OneStepIdentification,
     OneStepProblem,
     described,
-    identify_one_step,
+    identify_plant,
 )
 from .kalman import Filtered, filtered, smoothed
+from .plant import plant_rows, state_rows
 from .smoothing import (
     FEW_ROWS,
     NoiseEstimate,
     excerpt,
     filter_noise,
     noise_by_moments,
-    smooth,
+    smoothed_plant,
     with_likely_process,
 )
 from .trajectories import Trajectories
@@ -84,26 +86,28 @@ def identify(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     config = config or IdentificationConfig()
-    mpc = mpc.replace(model=mpc.model.suited_to_log(table))
+    whole = state_rows(mpc, table)
+    rows = plant_rows(mpc, whole)
+    mpc = mpc.replace(model=mpc.model.suited_to_log(rows))
     for _ in range(_ROUNDS):
-        found = _identified(mpc, table, config, seed)
-        model = found.model.suited_to_log(table, finer=True)
+        found = _identified(mpc, rows, config, seed)
+        model = found.model.suited_to_log(rows, finer=True)
         if model.scheme == found.model.scheme:
             break
         logger.info("Identified again: at what was found, %s is not accurate, %s is.", found.model.scheme, model.scheme)
         mpc = mpc.replace(model=model.with_theta(mpc.model.space.theta))
     found.warn()
-    return found
+    return replace(found, table=whole if found.table is rows else with_plant_states(whole, found.table))
 
 
 def _identified(mpc: MPC, table: TransitionTable, config: IdentificationConfig, seed: int) -> Identification:
-    """As :func:`identify`, with the model integrated as it is."""
+    """As :func:`identify`, from a table of :func:`plant_rows`, with the model integrated as it is."""
 
     def result(found: OneStepIdentification, table: TransitionTable, noise: NoiseEstimate) -> Identification:
         model = mpc.with_theta(found.theta).model
         return Identification(**vars(found), table=table, noise=noise, model=model)
 
-    first = identify_one_step(mpc, table, config, seed=seed)
+    first = identify_plant(mpc, table, config, seed=seed)
     source = excerpt(table, seed)
     few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)
@@ -113,7 +117,7 @@ def _identified(mpc: MPC, table: TransitionTable, config: IdentificationConfig, 
     logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
     centre = table.centring.centre[: table.ny]
     noisy = OneStepProblem(mpc, few.rows(), centre)
-    smoothed_table = smooth(mpc, table, noisy.theta(z), noise, unwrapped=first.unwrapped)
+    smoothed_table = smoothed_plant(mpc, table, noisy.theta(z), noise, first.unwrapped)
     clean = Trajectories.of(mpc, excerpt(smoothed_table, seed), first.unwrapped)
     problem = OneStepProblem(mpc, clean.rows(), centre, noisy.coordinates)
     return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), smoothed_table, noise)

@@ -59,7 +59,7 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     """What is known of the stage cost, from the rows as they were logged: smoothed ones would blur it."""
     if config.stage_cost == "fitted":
         return known
-    rows = _excerpt(known.table, known.seed)
+    rows = excerpt(known.table, known.seed)
     found = known_cost(known.mpc, rows)
     if found is None and config.stage_cost == "auto":
         other = _with_fitted_weights(known.mpc, rows)
@@ -227,7 +227,7 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     return mpc.with_theta(canonical(mpc, full(found.x)))
 
 
-def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
+def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
     """The table, or of a large one some stretches of consecutive rows."""
     n_blocks, wanted = -(-len(table) // _BLOCK), _ROWS // _BLOCK
     if n_blocks <= wanted:

@@ -18,7 +18,7 @@ from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
 from .linear_quadratic import is_linear_quadratic
-from .stages import Change, Stage
+from .stages import Change, Known, Stage
 
 _log = logging.getLogger(__name__)
 
@@ -72,6 +72,10 @@ class Method(ABC):
     @abstractmethod
     def stages(self) -> dict[str, Stage | Change]:
         """The stages by name, in their order; one without steps is a function from ``Known`` to ``Known``."""
+
+    def prepared(self, known: Known) -> Known:
+        """What the stages begin with, found from all transitions; by default what is known already."""
+        return known
 
     @property
     def name(self) -> str:
@@ -156,7 +160,7 @@ class Method(ABC):
         if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
             values, cross = cost.values, np.zeros((cost.nx, cost.nu))
             constant = float(values["constant"])
-            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
+            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant, values.get("D"))
             return mpc.replace(stage_cost=crossed)
         if self.cross_term:
             _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")

@@ -81,7 +81,7 @@ def checked(
         rows: The log.
         fixed: Whether the scheme is what the user asked for.
     """
-    x, u, reached = sampled(rows)
+    x, u, reached = sampled(rows, flow.n_states)
     known = flow.defined(x, u)
     x, u, reached = x[known], u[known], reached[known]
     exact = scheme.kind == "exact"
@@ -94,11 +94,14 @@ def checked(
     return IntegrationCheck(scheme.kind, 1 if exact else scheme.substeps, typical, largest, len(x), advice)
 
 
-def sampled(rows: Rows) -> tuple[Array, Array, Array]:
-    """States, inputs and the states after them of some of the rows, float64."""
+def sampled(rows: Rows, n_states: int) -> tuple[Array, Array, Array]:
+    """The plant's states ``(n, n_states)``, inputs and the states after them of some of the rows, float64.
+
+    Inputs that act late are taken as they are: they come from the same range.
+    """
     few = rows.sample(ROWS, 0)
     x, u, reached = (np.asarray(v, np.float64) for v in (few.observations, few.actions, few.next_observations))
-    return x, u, reached
+    return x[:, :n_states], u, reached[:, :n_states]
 
 
 def _advice(choice: Choice, scheme: Scheme, *, fixed: bool) -> str:

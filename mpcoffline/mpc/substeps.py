@@ -81,6 +81,11 @@ class Flow:
         self._slope = ca.Function("slope", [x, u, p], [ca.densify(ca.jacobian(ode(x, u, p), x))])
 
     @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.ode.numel_in(0))
+
+    @property
     def most(self) -> int:
         """As many substeps as a solver can be compiled with."""
         return int(np.clip(_MOST_OPERATIONS // max(1, self._substep.n_instructions()), 1, MOST_SUBSTEPS))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -53,7 +54,7 @@ def split_constant(expression: ca.SX, variables: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 # What is linear in one of its operands: which, and what it is of that one and the other.
-_FACTORS: dict[int, dict[int, Callable[[ca.SX, ca.SX], ca.SX]]] = {
+_FACTORS: dict[int, dict[int, Callable[[ca.SX, Any], ca.SX]]] = {
     ca.OP_NEG: {0: lambda a, _: -a},
     ca.OP_TWICE: {0: lambda a, _: 2 * a},
     ca.OP_MUL: {0: lambda a, b: a * b, 1: lambda a, b: b * a},
@@ -62,7 +63,7 @@ _FACTORS: dict[int, dict[int, Callable[[ca.SX, ca.SX], ca.SX]]] = {
 
 
 def _sum(a: ca.SX | None, b: ca.SX | None, sign: int) -> ca.SX | None:
-    """a + sign b, either of which may not be there."""
+    """The sum a + sign b, either of which may not be there."""
     if b is None:
         return a
     return sign * b if a is None else a + b if sign > 0 else a - b

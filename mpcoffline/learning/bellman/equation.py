@@ -34,6 +34,7 @@ class BellmanProblem:
 
     def __init__(self, mpc: MPC, value: ValueFunction, unit: float, cost: KnownCost | None = None) -> None:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
+        self.n_states = mpc.layout.n_states
         self._value, self._discount, self.unit = value, mpc.discount, unit
         self._scale = 1.0 if cost is None else cost.scale
 
@@ -74,7 +75,7 @@ class BellmanProblem:
 
 
 class PredictionError:
-    """The one-step prediction error, every coordinate in the spread of its increments.
+    """The one-step prediction error of the plant's states, every coordinate in the spread of its increments.
 
     ::
 
@@ -93,14 +94,16 @@ class PredictionError:
     def __init__(self, problem: BellmanProblem, sample: Columns, theta: Tensor, centre: Array | float = 0.0) -> None:
         self._problem = problem
         s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
+        s, reached = s[:, : problem.n_states], reached[:, : problem.n_states]
         with torch.no_grad():
-            missed = reached - problem.predicted(sample, theta)
+            missed = reached - problem.predicted(sample, theta)[:, : problem.n_states]
         rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
         self._scale = torch.from_numpy(increments_scale(rows.x, rows.reached, centre))
 
     def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean error over a minibatch, a scalar."""
         missed = batch.next_observations.double() - self._problem.predicted(batch, theta)
+        missed = missed[:, : self._problem.n_states]
         if self._angles:
             turns = torch.zeros_like(missed)
             angles = list(self._angles)

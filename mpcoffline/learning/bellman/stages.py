@@ -13,6 +13,7 @@ from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import identify
+from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.ends import ends_matter, priced_ends
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.potential import Potential
@@ -162,7 +163,7 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
     if known.cost is not None and known.cost.constant:
         mpc = known.mpc if horizon is not None or known.given is None else _as_far_as(known.given, known.mpc)
         return replace(known, mpc=mpc)
-    goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
+    goal = settled(known.mpc, known.table)
     exact = riccati_cost(known.mpc) if config.method == "auto" else None
     cost: TerminalCost = NormCost(goal) if exact is None else exact
     if exact is not None:
