@@ -79,10 +79,11 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
         )
     if found.constant:
         _log.warning(
-            "%s: the logged cost is %g in every transition that does not end an episode: it says when episodes end, "
-            "but not what is better before; stage and terminal cost stay the given ones, and the model is learned",
+            "%s: all costs are %g, so they do not tell what is good%s; stage and terminal cost stay the given ones, and "
+            "the model is learned",
             known.table.name,
             found.offset,
+            ", but that episodes should not end, or should" if np.any(known.table.terminations) else "",
         )
     return replace(known, cost=found)
 

@@ -26,6 +26,7 @@ QUICK: dict[str, Any] = {
     "trim": 1.0,
     "adapt_above": 0.0,
     "terminal": "quadratic",
+    "stage_cost": "fitted",
 }
 EPOCHS = 6  # three of (VALUE), two of (FIT), and the last one
 
