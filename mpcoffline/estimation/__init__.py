@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from .identification import Identification, IdentificationConfig, identify
-from .smoothing import NoiseEstimate, estimate_noise, identify_smoothed, smooth, with_measurement_noise
+from .identification import IdentificationConfig
+from .identifying import Identification, identify
+from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
 
 __all__ = [
     "Identification",
@@ -11,7 +12,6 @@ __all__ = [
     "NoiseEstimate",
     "estimate_noise",
     "identify",
-    "identify_smoothed",
     "smooth",
     "with_measurement_noise",
 ]
