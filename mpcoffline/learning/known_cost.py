@@ -17,7 +17,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
 from mpcoffline.mpc.scaling import Scaling
 
 from .stages import Known, KnownCost
@@ -209,14 +209,19 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     def full(z: Array) -> Array:
         return np.asarray(coordinates.theta(torch.from_numpy(np.asarray(z))).numpy())
 
+    def missed(theta: Array) -> Array:
+        return np.asarray(logged - mpc.stage_function(s, a, theta).full().ravel())
+
     def residuals(z: Array) -> Array:
-        missed = (mpc.stage_function(s, a, full(z)).full().ravel() - logged) / size
-        return np.asarray(np.nan_to_num(missed, nan=1e6, posinf=1e6, neginf=-1e6))
+        """With the best constant for every z."""
+        errors = -missed(full(z)) / size
+        return np.asarray(np.nan_to_num(errors - errors.mean(), nan=1e6, posinf=1e6, neginf=-1e6))
 
     def jacobian(z: Array) -> Array:
         values = full(z)
         change = np.where(coordinates.logarithmic, values[coordinates.mask], coordinates.scale)
-        return np.asarray(np.nan_to_num(slopes(s, a, values).full()[coordinates.mask].T * change / size))
+        rates = slopes(s, a, values).full()[coordinates.mask].T * change / size
+        return np.asarray(np.nan_to_num(rates - rates.mean(axis=0)))
 
     low, high = np.minimum(coordinates.low, -1e-9), np.maximum(coordinates.high, 1e-9)
     found = scipy.optimize.least_squares(
@@ -224,7 +229,8 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     )
     if not np.mean(found.fun**2) <= _EXACT:
         return None
-    return mpc.with_theta(canonical(mpc, full(found.x)))
+    fitted = canonical(mpc, full(found.x))
+    return mpc.with_theta(with_level(mpc, fitted, float(missed(fitted).mean())))
 
 
 def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:

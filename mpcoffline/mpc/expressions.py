@@ -91,6 +91,23 @@ def traced(name: str, function: ca.Function) -> ca.Function:
     return function
 
 
+def scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.SX:
+    """Evaluates a cost expression, turning CasADi's dimension errors into one that says what is expected.
+
+    Raises:
+        InvalidArgumentError: For an expression that fails, or is no scalar.
+    """
+    try:
+        cost = ca.densify(ca.SX(expression()))
+    except (InvalidArgumentError, RuntimeError) as error:
+        raise InvalidArgumentError(
+            name, expected=f"a cost for nx = {nx}, nu = {nu}", actual=str(error).splitlines()[-1]
+        ) from error
+    if cost.shape != (1, 1):
+        raise InvalidArgumentError(name, expected="a scalar", actual=f"shape {cost.shape}")
+    return cost
+
+
 def without_tables(function: ca.Function) -> ca.Function:
     """An SX function with the tables that it calls as arithmetic; calls of other functions stay."""
     program = list(instructions(function))
@@ -137,23 +154,6 @@ def _called(function: ca.Function, elements: list[ca.SX]) -> list[ca.SX]:
         start += argument.nnz()
         arguments.append(argument)
     return [result.nz[k] for result in function.call(arguments) for k in range(result.nnz())]
-
-
-def scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.SX:
-    """Evaluates a cost expression, turning CasADi's dimension errors into one that says what is expected.
-
-    Raises:
-        InvalidArgumentError: For an expression that fails, or is no scalar.
-    """
-    try:
-        cost = ca.densify(ca.SX(expression()))
-    except (InvalidArgumentError, RuntimeError) as error:
-        raise InvalidArgumentError(
-            name, expected=f"a cost for nx = {nx}, nu = {nu}", actual=str(error).splitlines()[-1]
-        ) from error
-    if cost.shape != (1, 1):
-        raise InvalidArgumentError(name, expected="a scalar", actual=f"shape {cost.shape}")
-    return cost
 
 
 def function_to_json(function: ca.Function) -> dict[str, Any]:
