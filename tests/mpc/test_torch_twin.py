@@ -276,7 +276,7 @@ def test_wrong_inputs_are_refused() -> None:
 
 
 def test_networks_are_products_of_matrices() -> None:
-    """Equal to CasADi in value and gradient, with parameters around, and a few hundred operations instead of ten thousand."""
+    """Equal to CasADi in value and gradient, with parameters around, in a few hundred operations."""
     rng = np.random.default_rng(0)
     x, u, theta = ca.SX.sym("x", 4), ca.SX.sym("u", 1), ca.SX.sym("theta", 2)
     weights = [rng.normal(size=size) / 5 for size in ((32, 5), (32, 32), (4, 32))]
