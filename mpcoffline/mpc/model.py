@@ -114,6 +114,8 @@ class Model(Component):
         discrete: bool = True,
         residual: bool = False,
         learn_weights: bool = False,
+        integrator: str = "auto",
+        delay: int | Sequence[int] | None = None,
     ) -> Model:
         """A model from a ``torch.nn.Module`` that was trained elsewhere.
 
@@ -137,6 +139,8 @@ class Model(Component):
             residual: Whether it gives the change of the state in a step, ``x+ = x + module(x, u)``.
             learn_weights: Whether its weights are parameters that learning may change, named as in the module with
                 underscores (``0_weight``); by default they are fixed numbers, with which C computes much faster.
+            integrator: As in the class, for ``discrete=False``.
+            delay: As in the class.
 
         Raises:
             InvalidArgumentError: For what cannot be traced, a layer that is not known (it is named), or sizes that do
@@ -153,7 +157,9 @@ class Model(Component):
                 ) from error
             return x + out if residual else out
 
-        return cls(dynamics, nx, nu, dt, network.weights if learn_weights else None, discrete=discrete or residual)
+        parameters = network.weights if learn_weights else None
+        is_map = discrete or residual
+        return cls(dynamics, nx, nu, dt, parameters, discrete=is_map, integrator=integrator, delay=delay)
 
     def _take(self, function: ca.Function, integrator: str, scheme: Scheme | None, *, settled: bool = True) -> None:
         """Takes an ODE with its scheme, or without one a map as it is."""
