@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpcoffline.core.checks import check_integers
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
@@ -19,6 +20,7 @@ from .identification import (
     identify_one_step,
 )
 from .kalman import Filtered, filtered, smoothed
+from .multi_step import MultiStepProblem, Windows
 from .smoothing import (
     FEW_ROWS,
     NoiseEstimate,
@@ -28,6 +30,7 @@ from .smoothing import (
     smooth,
     with_likely_process,
 )
+from .structure import MultiStepCheck, check_structure
 from .trajectories import Trajectories
 from .uncertainty import Misfit, clusters
 
@@ -46,14 +49,22 @@ class Identification(OneStepIdentification):
     Attributes:
         table: The smoothed data; the given table itself where its noise is negligible.
         noise: The noise found.
+        multi_step: How well the model predicts many steps, and whether other parameters would do so better, which says
+            that its structure is wrong; None where the log has no stretches long enough.
     """
 
     table: TransitionTable
     noise: NoiseEstimate
+    multi_step: MultiStepCheck | None = None
 
 
 def identify(
-    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+    mpc: MPC,
+    table: TransitionTable,
+    config: IdentificationConfig | None = None,
+    *,
+    horizon: int | None = None,
+    seed: int = 0,
 ) -> Identification:
     """Identifies the model from a log, and takes the measurement noise out of the log.
 
@@ -65,10 +76,20 @@ def identify(
     the data most likely under the extended Kalman filter, by Gauss-Newton on its innovations (Ljung, "System
     Identification", ch. 7: a prediction-error method), noise and model estimated in turn.
 
+    With ``horizon``, the parameters that predict so many steps open loop best, from starts that are fitted, too (output
+    error, :class:`~mpcoffline.estimation.multi_step.MultiStepProblem`). With the right structure that gains nothing;
+    with a wrong one it predicts farther, and controllers on it were no better.
+
+    Example:
+        >>> found = mpcoffline.estimation.identify(mpc, table)
+        >>> better = mpc.with_theta(found.theta)
+        >>> print(found.multi_step)
+
     Args:
         mpc: The MPC; its parameters are theta_0, and all but those of the model stay as they are.
         table: The transitions, in the order of time within each episode. Rows that were left out are gaps.
         config: Prior and effort.
+        horizon: Steps that are predicted in the fit; None for one, 10 to 25 for output error.
         seed: Seeds the choice of rows and the restarts.
 
     Returns:
@@ -78,35 +99,61 @@ def identify(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     config = config or IdentificationConfig()
+    if horizon is not None:
+        check_integers(1, horizon=horizon)
     first = identify_one_step(mpc, table, config, seed=seed)
     source = excerpt(table, seed)
-    few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
+    all_of_it = Trajectories.of(mpc, source, first.unwrapped)
+    few = all_of_it.thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)
-    if noise.source == "unknown" or noise.negligible:
-        first.warn()
-        return Identification(**vars(first), table=table, noise=noise)
-    z, noise, misfit = _most_likely(mpc, few, first, config, (table, source))
-    logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
+    silent = noise.source == "unknown" or noise.negligible
     centre = table.centring.centre[: table.ny]
-    theta = OneStepProblem(mpc, few.rows(), centre).theta(z)
-    result = smooth(mpc, table, theta, noise, unwrapped=first.unwrapped)
-    clean = Trajectories.of(mpc, excerpt(result, seed), first.unwrapped)
-    problem = OneStepProblem(mpc, clean.rows(), centre)
-    found = described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped)
+    coordinates = OneStepProblem(mpc, few.rows(), centre)
+    z, misfit = coordinates.z(first.theta), Misfit.nothing()
+    if not silent:
+        z, noise, misfit = _most_likely(few, coordinates, first, config, source)
+        logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
+    if horizon is not None and len(z):
+        z, misfit = _predicting_far(mpc, few, coordinates, (np.zeros_like(z), z), horizon, config, source)
+    found, result = first, table
+    if not silent:
+        result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
+    if not silent or horizon is not None:
+        clean = few if silent else Trajectories.of(mpc, excerpt(result, seed), first.unwrapped)
+        problem = OneStepProblem(mpc, clean.rows(), centre)
+        found = described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped)
     found.warn()
-    return Identification(**vars(found), table=result, noise=noise)
+    check = check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
+    if check is not None:
+        logger.log(logging.WARNING if check.suspicious else logging.INFO, "%s", check)
+    return Identification(**vars(found), table=result, noise=noise, multi_step=check)
+
+
+def _predicting_far(
+    mpc: MPC,
+    few: Trajectories,
+    coordinates: OneStepProblem,
+    begin: tuple[Array, ...],
+    horizon: int,
+    config: IdentificationConfig,
+    source: TransitionTable,
+) -> tuple[Array, Misfit]:
+    """The parameters that predict many steps best, from the best first guess, and what the data say of them."""
+    windows = Windows.of(few, horizon, horizon, full=False)
+    problem = MultiStepProblem(mpc, windows, coordinates, config.prior_spread)
+    ends = [problem.fitted(z, config.max_iterations) for z in begin]
+    z, starts, there = min(ends, key=lambda end: end[2].cost)
+    return z, problem.misfit(z, starts, there, source.episode_ids[windows.rows])
 
 
 def _most_likely(
-    mpc: MPC,
     few: Trajectories,
+    coordinates: OneStepProblem,
     first: OneStepIdentification,
     config: IdentificationConfig,
-    tables: tuple[TransitionTable, TransitionTable],
+    source: TransitionTable,
 ) -> tuple[Array, NoiseEstimate, Misfit]:
     """The parameters of the largest likelihood and prior, the noise, and what the data say about the parameters."""
-    table, source = tables
-    coordinates = OneStepProblem(mpc, few.rows(), table.centring.centre[: table.ny])
     z, noise = coordinates.z(first.theta), noise_by_moments(few, first.theta)
     about = few.measured
     for _ in range(_ROUNDS):
