@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .identification import IdentificationConfig
 from .identifying import Identification, identify
+from .residual import Residual, fit_residual, fit_residuals, with_residual
 from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
 from .structure import MultiStepCheck
 
@@ -12,8 +13,12 @@ __all__ = [
     "IdentificationConfig",
     "MultiStepCheck",
     "NoiseEstimate",
+    "Residual",
     "estimate_noise",
+    "fit_residual",
+    "fit_residuals",
     "identify",
     "smooth",
     "with_measurement_noise",
+    "with_residual",
 ]

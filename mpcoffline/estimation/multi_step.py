@@ -70,6 +70,18 @@ class Windows(NamedTuple):
         return Windows(y[:, which], u[:, which], valid[:, which], rows[which], scale)
 
 
+def open_loop(mpc: MPC, windows: Windows) -> Array:
+    """Prediction errors in spreads, from the measured starts, ``(H + 1, W, nx)``; what is absurd counts as that."""
+    x, errors = windows.y[0] * windows.scale, [np.zeros_like(windows.y[0])]
+    for u, y in zip(windows.u, windows.y[1:], strict=True):
+        x = mpc.dynamics_function(x.T, u.T, mpc.theta).full().T
+        off = x / windows.scale - y
+        good = (np.abs(off) < _ABSURD).all(axis=1)
+        errors.append(np.where(good[:, None], off, _ABSURD))
+        x = np.where(np.isfinite(x), x, 1e6 * windows.scale)
+    return np.stack(errors)
+
+
 class _Pass(NamedTuple):
     """A simulation of all windows, and its least-squares problem in the starts x and in theta."""
 

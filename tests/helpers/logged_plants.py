@@ -63,3 +63,39 @@ def tank_mpc(k: Array | tuple[float, float, float] = (0.05, 0.03, 0.001)) -> MPC
     }
     model = Model(ode, 2, 1, TANK_DT, parameters)
     return MPC(model, QuadraticCost(np.eye(2), [[1.0]]), QuadraticCost(np.eye(2)), 10, 0.95, [0.0], [1.0])
+
+
+def pendulum_log(n_episodes: int, steps: int, seed: int, *, friction: bool) -> TransitionTable:
+    """Episodes of a hanging pendulum, shaken at random: angle and speed; friction dry (smooth) and viscous, or none."""
+    rng = np.random.default_rng(seed)
+    x, dt = rng.uniform([-1.5, -1.0], [1.5, 1.0], (n_episodes, 2)), 0.05
+
+    def rate(x: Array, u: Array) -> Array:
+        lost = 0.8 * np.tanh(5.0 * x[:, 1]) + 0.3 * x[:, 1] if friction else 0.0
+        return np.stack([x[:, 1], -9.8 * np.sin(x[:, 0]) + 3.0 * u - lost], axis=1)
+
+    states, inputs = [x], []
+    for t in range(steps):
+        u = rng.uniform(-2.0, 2.0, n_episodes) if t % 5 == 0 else inputs[-1]
+        inputs.append(u)
+        for _ in range(5):
+            h = dt / 5
+            a = rate(x, u)
+            b = rate(x + 0.5 * h * a, u)
+            c = rate(x + 0.5 * h * b, u)
+            x = x + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(x + h * c, u))
+        states.append(x)
+    path, n = np.stack(states, axis=1), n_episodes * steps
+    zeros, ids = np.zeros(n), np.repeat(np.arange(n_episodes), steps)
+    s, a, reached = path[:, :-1].reshape(n, 2), np.stack(inputs, axis=1).reshape(n, 1), path[:, 1:].reshape(n, 2)
+    return TransitionTable.from_arrays(s, a, zeros, reached, zeros, ids)
+
+
+def pendulum_mpc() -> MPC:
+    """The same pendulum without friction, with rough parameters."""
+
+    def ode(x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        return ca.vertcat(x[1], -p["g"] * ca.sin(x[0]) + p["b"] * u[0])
+
+    model = Model(ode, 2, 1, 0.05, {"g": Parameter(8.0, low=1.0), "b": Parameter(2.0, low=0.1)})
+    return MPC(model, QuadraticCost(np.eye(2), [[0.1]]), QuadraticCost(np.eye(2)), 10, 0.95, [-2.0], [2.0])

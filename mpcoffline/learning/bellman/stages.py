@@ -10,7 +10,7 @@ import numpy as np
 
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import identify
+from mpcoffline.estimation import fit_residual, identify, with_residual
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
@@ -39,10 +39,13 @@ class StartConfig:
         adapt_above: With ``init="identified"``, steps on cost and model together (``fit_n_steps``) are made only where
             the identified model misses more than this share of an increment (root mean square of the one-step
             errors): where its structure is not the plant's. Else the model stays and the cost alone is fitted.
+        residual: With ``init="identified"``, whether a model that misses more than that gets a learned residual, if
+            held-out episodes ask for one (:func:`mpcoffline.estimation.fit_residual`); it stays then, too.
     """
 
     init: Init = "nominal"
     adapt_above: float = 0.0
+    residual: bool = False
 
     def __post_init__(self) -> None:
         check_known("init", self.init, get_args(Init))
@@ -56,8 +59,18 @@ def identified(known: Known, config: StartConfig) -> Known:
     found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    mpc = known.mpc.with_theta(found.theta)
-    return replace(known, mpc=mpc, table=found.table, model_error=found.error_after)
+    known = replace(known, mpc=known.mpc.with_theta(found.theta), table=found.table, model_error=found.error_after)
+    return completed(known) if config.residual and found.error_after > config.adapt_above else known
+
+
+def completed(known: Known) -> Known:
+    """The identified model with a learned residual, where held-out episodes ask for one."""
+    residual = fit_residual(known.mpc, known.table, known.seed)
+    _log.info("%s", residual)
+    if not residual.taken:
+        return known
+    mpc = with_residual(known.mpc, residual)
+    return replace(known, mpc=mpc, model_error=residual.one_step[1], residual_share=residual.share)
 
 
 class LearnValue(Stage):
@@ -97,7 +110,10 @@ class LearnParameters(Stage):
     def begin(self, known: Known) -> Training:
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
-        mpc, config = in_units_of(known.mpc, known.table), self._adapting(known.model_error)
+        missed = (
+            0.0 if known.residual_share else known.model_error
+        )  # it belongs to the parameters that it was fitted with
+        mpc, config = in_units_of(known.mpc, known.table), self._adapting(missed)
         return ParameterTraining(mpc, known.constant_value, known.table, known.groups, config, seed=known.seed)
 
     def _adapting(self, missed: float | None) -> ParameterConfig:
@@ -118,7 +134,8 @@ class LearnParameters(Stage):
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds theta and the result."""
-        return replace(known, mpc=known.mpc.with_theta(training.result.theta), result=training.result)
+        result = replace(training.result, residual_share=known.residual_share)
+        return replace(known, mpc=known.mpc.with_theta(result.theta), result=result)
 
 
 @dataclass(frozen=True)
