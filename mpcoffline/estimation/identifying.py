@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,7 @@ def identify(
     config: IdentificationConfig | None = None,
     *,
     horizon: int | None = None,
+    tried: Sequence[str] = (),
     seed: int = 0,
 ) -> Identification:
     """Identifies the model from a log, and takes the measurement noise out of the log.
@@ -90,6 +92,7 @@ def identify(
         table: The transitions, in the order of time within each episode. Rows that were left out are gaps.
         config: Prior and effort.
         horizon: Steps that are predicted in the fit; None for one, 10 to 25 for output error.
+        tried: What of the model's structure was varied before, in words: the check of structure repeats it.
         seed: Seeds the choice of rows and the restarts.
 
     Returns:
@@ -125,6 +128,7 @@ def identify(
     found.warn()
     check = check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
     if check is not None:
+        check = check.having_tried(*tried)
         logger.log(logging.WARNING if check.suspicious else logging.INFO, "%s", check)
     return Identification(**vars(found), table=result, noise=noise, multi_step=check)
 

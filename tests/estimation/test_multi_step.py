@@ -129,7 +129,9 @@ def test_an_unmodelled_dead_time_is_suspicious(caplog: pytest.LogCaptureFixture)
     assert check.suspicious
     assert "dead time" in caplog.text
     assert "None of them was varied" in str(check)
-    assert "Tried: dead times up to 5 steps." in str(check.having_tried("dead times up to 5 steps"))
+    again = identify(tank_mpc(), tank_log(12, 120, 1, delay=2), tried=["a residual"]).multi_step
+    assert again is not None
+    assert "Tried: a residual; RK4." in str(again.having_tried("RK4"))
 
 
 def test_a_log_without_stretches_says_nothing() -> None:
