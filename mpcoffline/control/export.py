@@ -16,6 +16,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import DDPSolver, starts
 from mpcoffline.solvers.ddp.codegen import generated, text
+from mpcoffline.solvers.scaling import input_units
 
 from .policy import MPCPolicy
 
@@ -112,6 +113,7 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
         f"#define SEGMENTS {segments.shape[1]}",
         _array("low", mpc.action_low),
         _array("high", mpc.action_high),
+        _array("unit", input_units(mpc)),
         _array("candidates", segments),
         "const mpc_parameters mpc_learned_parameters = {\n" + "\n".join(values) + "\n};",
         "/* mpc_parameters is nothing but MPC_NP numbers: the size of this array is negative if it were not. */",

@@ -10,8 +10,10 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, identify
+from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
@@ -85,12 +87,14 @@ def diagnose(
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
-    table = TransitionTable.of(dataset)
-    found = identify(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.with_theta(found.theta)
-    ensemble = Ensemble(nominal, clean, found, seed=seed)
-    cost = LoggedCost(clean, seed)
     policies = MPCPolicy(nominal), MPCPolicy(learned)
+    if nominal.layout.delay != learned.layout.delay:  # of the dead time that the learner has found
+        nominal = nominal.with_delay(learned.layout.delay)
+    table = with_memory(TransitionTable.of(dataset), learned.layout)
+    found = identify(nominal, table, seed=seed)
+    clean, identified = found.table, nominal.replace(model=found.model)
+    ensemble = Ensemble(identified, clean, found, seed=seed)
+    cost = LoggedCost(clean, seed, None if learned.layout.has_previous else learned.ny)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
     starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
     first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
@@ -108,7 +112,7 @@ def diagnose(
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
         weights=weight_checks(nominal, learned),
-        at_bounds=bound_names(learned, nominal),
+        at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
         lag=lag,
         noise=found.noise,
@@ -117,8 +121,8 @@ def diagnose(
         n_rows=len(table),
         n_episodes=table.n_episodes,
         traces=Traces(
-            first.states,
-            second.states,
+            first.states[..., : learned.ny],
+            second.states[..., : learned.ny],
             np.stack(returns_of(learner.value_function, clean, learned.discount)),
             reference,
         ),
@@ -144,7 +148,7 @@ def _theorem(
     return TheoremCheck(
         value_growth(value, table, states, bool(simulation.lost[0].any())),
         outside_support(table, states),
-        () if reference is None else closed_loop_eigenvalues(learned, policy.solver, table, reference),
+        () if reference is None else closed_loop_eigenvalues(learned, policy.solver, table, settled(learned, table)),
     )
 
 

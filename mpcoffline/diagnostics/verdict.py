@@ -132,7 +132,7 @@ def _withheld(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_row
     if lag.found:
         reasons.append(
             f"Inputs act late (past ones move the state {100 * lag.share:.0f} % as much as present ones), which no"
-            " model here knows: add the last input to the model's state."
+            " model here knows: give the model their dead time (Model(..., delay=)), or the actuator's own state."
         )
     if noise.level > _MUCH_NOISE:
         reasons.append(

@@ -19,8 +19,10 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
+from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
+from .plant import plant_rows
 from .uncertainty import Misfit, clusters, uncertainty
 
 logger = logging.getLogger(__name__)
@@ -29,9 +31,8 @@ FULL_TURN = 2.0 * np.pi
 _NEAR_TURN = 0.5  # rad
 _AT_BOUND = 1e-4  # in scaled coordinates
 _WEAKEST_PRIOR = 1e-10
-_NOT_FINITE = 1e3  # what a prediction that is not finite counts, in spreads of the increments
+_ABSURD = 1e3  # spreads of the increments: what a prediction that is not finite counts; beyond, errors count by less
 _FEW_ROWS = 1_000  # for the way to the minimum
-_LARGEST = 1e150  # whose square is a float64
 _PRIOR_ROUNDS = 3  # until sigma^2, which begins at 1, is that of the minimum
 _MAX_ENTRIES = 20_000_000  # of the Jacobian: 160 MB
 
@@ -72,12 +73,13 @@ class OneStepIdentification:
         deviation: One standard deviation of each, given data and prior, with the episodes' own scatter: errors that
             last over many rows count as few; 0 where not identified, ``(size,)``.
         scale: Spread of the increments s+ - s, ``(nx,)``.
-        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``.
+        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``; a single one counts 1000 at most.
         errors_after: The same at theta.
         at_bound: Names of the parameters that ended at a bound.
         undetermined: Parameters, or combinations of them, that the data do not determine: moved to either side by as
             much as the prior leaves open, they predict the data as well. These stay near theta_0.
         unwrapped: Coordinates that proved to be wrapped angles.
+        absurd: Rows that the model predicts by more than 1000 spreads wrong, or not at all, and rows looked at.
     """
 
     theta: Array
@@ -88,6 +90,7 @@ class OneStepIdentification:
     at_bound: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
     unwrapped: tuple[int, ...] = ()
+    absurd: tuple[int, int] = (0, 0)
 
     @property
     def error_before(self) -> float:
@@ -108,6 +111,9 @@ class OneStepIdentification:
             logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", self.at_bound)
         if self.unwrapped:
             logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(self.unwrapped))
+        if self.absurd[0]:
+            text = "The model's predictions of %d of %d rows are absurd or not finite: is it right there, are the data?"
+            logger.warning(text, *self.absurd)
 
 
 class Rows(NamedTuple):
@@ -133,14 +139,17 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: Rows, centre: Array | float = 0.0) -> None:
-        self.coordinates = c = Coordinates(mpc, ("model",))
+    def __init__(
+        self, mpc: MPC, rows: Rows, centre: Array | float = 0.0, coordinates: Coordinates | None = None
+    ) -> None:
+        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
+        c = coordinates or Coordinates(mpc, ("model",), Scaling(rows.x, rows.u, self.scale))
+        self.coordinates = c
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
         self.names = [names[i] for i in self.free]
-        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
@@ -170,12 +179,19 @@ class OneStepProblem:
         return (predicted - self.rows.reached) / self.scale
 
     def linearised(self, z: Array) -> tuple[Array, Array]:
-        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall."""
+        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall.
+
+        Errors e beyond c = 1000 count c (1 + log(e / c)): a few absurd ones do not decide what the model is.
+        """
         predicted, slopes = self.model.with_slopes(self.rows.x, self.rows.u, self.theta(z))
         errors = (predicted - self.rows.reached) / self.scale
         jacobian = slopes[:, :, self.free] * self.slopes(z) / self.scale[:, None]
         finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
-        return np.where(finite, errors, _NOT_FINITE), np.where(finite[:, :, None], jacobian, 0.0)
+        errors, jacobian = np.where(finite, errors, _ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
+        beyond = np.maximum(np.abs(errors) / _ABSURD, 1.0)
+        if (beyond > 1.0).any():
+            errors, jacobian = errors * (1.0 + np.log(beyond)) / beyond, jacobian / beyond[:, :, None]
+        return errors, jacobian
 
     def descend(self, start: Array, prior: float, max_iterations: int) -> _Descent:
         """Trust-region Gauss-Newton from one start, within the bounds (scipy's ``trf``)."""
@@ -205,13 +221,17 @@ class OneStepProblem:
                 gtol=1e-12,
             )
         except (ValueError, np.linalg.LinAlgError) as error:  # squares of the derivative overflow
-            raise InvalidDataError(
-                "identification",
-                expected="data on which the model's prediction has finite derivatives",
-                actual=f"states up to {np.abs(self.rows.x).max():g} ({error})",
-                hint="Are the data in the model's units?",
-            ) from error
+            raise self.unpredictable(str(error)) from error
         return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
+
+    def unpredictable(self, reason: str) -> InvalidDataError:
+        """The error that says that the model makes nothing of the data."""
+        return InvalidDataError(
+            "identification",
+            expected="data that the model can predict",
+            actual=f"states up to {np.abs(self.rows.x).max():g} ({reason})",
+            hint="Are the data in the model's units?",
+        )
 
 
 def identify_one_step(
@@ -238,10 +258,16 @@ def identify_one_step(
         The identified parameters with their errors; theta_0 itself for a model without parameters.
 
     Raises:
-        InvalidDataError: If the data have other dimensions than the MPC.
+        InvalidDataError: If the data have other dimensions than the MPC, or the model predicts none of them at all.
     """
+    return identify_plant(mpc, plant_rows(mpc, table), config, seed=seed)
+
+
+def identify_plant(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+) -> OneStepIdentification:
+    """As :func:`identify_one_step`, from a table of :func:`plant_rows`."""
     config = config or IdentificationConfig()
-    table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
     rows, episodes = _rows(mpc, table, config, rng)
@@ -253,7 +279,10 @@ def identify_one_step(
         return described(mpc, problem, np.zeros(0), Misfit.nothing(), config.prior_spread, unwrapped)
     z, prior = _best_descent(problem, config, rng)
     variance = len(problem.rows.x) * prior * config.prior_spread**2
-    return described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
+    found = described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
+    if found.absurd[0] == len(rows.x):
+        raise problem.unpredictable("the best prediction of every row is more than 1000 increments off")
+    return found
 
 
 def _misfit(problem: OneStepProblem, z: Array, variance: float, episodes: NDArray[np.integer[Any]]) -> Misfit:
@@ -282,6 +311,8 @@ def described(
         unwrapped: Coordinates that are wrapped angles.
     """
     theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
+    errors = problem.errors(theta)
+    absurd = int(np.sum(~(np.abs(errors) <= _ABSURD).all(axis=1)))
     covariance, undetermined = uncertainty(misfit, z, (problem.low, problem.high), spread, problem.names)
     deviation = np.zeros_like(theta)
     identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
@@ -291,24 +322,12 @@ def described(
         deviation,
         problem.scale,
         _root_mean_square(problem.errors(mpc.theta)),
-        _root_mean_square(problem.errors(theta)),
+        _root_mean_square(errors),
         tuple(name for name, bound in zip(problem.names, _at_bound(problem, z), strict=True) if bound),
         undetermined,
         unwrapped,
+        (absurd, len(errors)),
     )
-
-
-def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> Array:
-    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1.
-
-    Args:
-        x: States, ``(n, nx)``.
-        reached: Those after them, ``(n, nx)``.
-        centre: What the table that they are from was packed without, ``(nx,)``: it was not rounded to float32.
-    """
-    spread = (reached - x).std(axis=0)
-    rounding, least = (1e-6 * np.abs(x - offset).max(axis=0) for offset in (centre, 0.0))
-    return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
 
 
 def _rows(
@@ -316,7 +335,7 @@ def _rows(
 ) -> tuple[Rows, NDArray[np.integer[Any]]]:
     """A random subset in float64, small enough for its Jacobian, and the episode of each row."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
-    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
+    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * table.ny)))
     sample = table.sample(count, rng)
     columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)
@@ -370,5 +389,5 @@ def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
 
 def _root_mean_square(errors: Array) -> Array:
     """Of each coordinate ``(nx,)``, whatever the model predicts."""
-    finite = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_LARGEST, neginf=-_LARGEST)
-    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_LARGEST, _LARGEST) ** 2, axis=0)))
+    finite = np.nan_to_num(errors, nan=_ABSURD, posinf=_ABSURD, neginf=-_ABSURD)
+    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_ABSURD, _ABSURD) ** 2, axis=0)))

@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, Model
 
 from .identification import (
     IdentificationConfig,
     OneStepIdentification,
     OneStepProblem,
     described,
-    identify_one_step,
+    identify_plant,
 )
 from .kalman import Filtered, filtered, smoothed
 from .multi_step import MultiStepProblem, Windows
+from .plant import plant_rows, state_rows
 from .smoothing import (
     FEW_ROWS,
     NoiseEstimate,
     excerpt,
     filter_noise,
     noise_by_moments,
-    smooth,
+    smoothed_plant,
     with_likely_process,
 )
 from .structure import MultiStepCheck, check_structure
@@ -50,12 +52,14 @@ class Identification(OneStepIdentification):
     Attributes:
         table: The smoothed data; the given table itself where its noise is negligible.
         noise: The noise found.
+        model: The identified model, integrated as accurately as the log asks for.
         multi_step: How well the model predicts many steps, and whether other parameters would do so better, which says
             that its structure is wrong; None where the log has no stretches long enough.
     """
 
     table: TransitionTable
     noise: NoiseEstimate
+    model: Model
     multi_step: MultiStepCheck | None = None
 
 
@@ -77,6 +81,10 @@ def identify(
     That is biased where s is measured with noise. Where the noise found is not negligible: the parameters that make
     the data most likely under the extended Kalman filter, by Gauss-Newton on its innovations (Ljung, "System
     Identification", ch. 7: a prediction-error method), noise and model estimated in turn.
+
+    A model that takes its substeps from the log (``integrator="auto"``) may need more at what is identified than at
+    theta_0; then all is done again, from theta_0, with as many: a coarse Runge-Kutta step has the same one-step error
+    at another, wrong time constant, and the data would seem sure of it.
 
     With ``horizon``, the parameters that predict so many steps open loop best, from starts that are fitted, too (output
     error, :class:`~mpcoffline.estimation.multi_step.MultiStepProblem`). With the right structure that gains nothing;
@@ -104,33 +112,63 @@ def identify(
     config = config or IdentificationConfig()
     if horizon is not None:
         check_integers(1, horizon=horizon)
-    first = identify_one_step(mpc, table, config, seed=seed)
+    whole = state_rows(mpc, table)
+    rows = plant_rows(mpc, whole)
+    mpc = mpc.replace(model=mpc.model.suited_to_log(rows))
+    for _ in range(_ROUNDS):
+        found = _identified(mpc, rows, config, horizon, seed)
+        model = found.model.suited_to_log(rows, finer=True)
+        if model.scheme == found.model.scheme:
+            break
+        logger.info("Identified again: at what was found, %s is not accurate, %s is.", found.model.scheme, model.scheme)
+        mpc = mpc.replace(model=model.with_theta(mpc.model.space.theta))
+    found.warn()
+    check = _checked(mpc, rows, found, config, seed)
+    if check is not None:
+        substeps = () if found.model.integrator != "auto" else (f"the integrator ({found.model.scheme} is accurate)",)
+        check = check.having_tried(*tried, *substeps)
+        logger.log(logging.WARNING if check.suspicious else logging.INFO, "%s", check)
+    table = whole if found.table is rows else with_plant_states(whole, found.table)
+    return replace(found, table=table, multi_step=check)
+
+
+def _checked(
+    mpc: MPC, rows: TransitionTable, found: Identification, config: IdentificationConfig, seed: int
+) -> MultiStepCheck | None:
+    """The check of structure, on the rows as logged."""
+    source = excerpt(rows, seed)
+    few = Trajectories.of(mpc, source, found.unwrapped).thinned(FEW_ROWS, seed)
+    return check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
+
+
+def _identified(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig, horizon: int | None, seed: int
+) -> Identification:
+    """As :func:`identify`, from a table of :func:`plant_rows`, with the model integrated as it is."""
+
+    def result(found: OneStepIdentification, table: TransitionTable, noise: NoiseEstimate) -> Identification:
+        model = mpc.with_theta(found.theta).model
+        return Identification(**vars(found), table=table, noise=noise, model=model)
+
+    first = identify_plant(mpc, table, config, seed=seed)
     source = excerpt(table, seed)
-    all_of_it = Trajectories.of(mpc, source, first.unwrapped)
-    few = all_of_it.thinned(FEW_ROWS, seed)
+    few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)
     silent = noise.source == "unknown" or noise.negligible
+    if silent and horizon is None:
+        return result(first, table, noise)
     centre = table.centring.centre[: table.ny]
-    coordinates = OneStepProblem(mpc, few.rows(), centre)
-    z, misfit = coordinates.z(first.theta), Misfit.nothing()
+    noisy = OneStepProblem(mpc, few.rows(), centre)
+    z, misfit = noisy.z(first.theta), Misfit.nothing()
     if not silent:
-        z, noise, misfit = _most_likely(few, coordinates, first, config, source)
+        z, noise, misfit = _most_likely(few, noisy, first, config, source)
         logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
     if horizon is not None and len(z):
-        z, misfit = _predicting_far(mpc, few, coordinates, (np.zeros_like(z), z), horizon, config, source)
-    found, result = first, table
-    if not silent:
-        result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
-    if not silent or horizon is not None:
-        clean = few if silent else Trajectories.of(mpc, excerpt(result, seed), first.unwrapped)
-        problem = OneStepProblem(mpc, clean.rows(), centre)
-        found = described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped)
-    found.warn()
-    check = check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
-    if check is not None:
-        check = check.having_tried(*tried)
-        logger.log(logging.WARNING if check.suspicious else logging.INFO, "%s", check)
-    return Identification(**vars(found), table=result, noise=noise, multi_step=check)
+        z, misfit = _predicting_far(mpc, few, noisy, (np.zeros_like(z), z), horizon, config, source)
+    clean = table if silent else smoothed_plant(mpc, table, noisy.theta(z), noise, first.unwrapped)
+    rows = Trajectories.of(mpc, excerpt(clean, seed), first.unwrapped).rows()
+    problem = OneStepProblem(mpc, rows, centre, noisy.coordinates)
+    return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), clean, noise)
 
 
 def _predicting_far(

@@ -74,7 +74,7 @@ def open_loop(mpc: MPC, windows: Windows) -> Array:
     """Prediction errors in spreads, from the measured starts, ``(H + 1, W, nx)``; what is absurd counts as that."""
     x, errors = windows.y[0] * windows.scale, [np.zeros_like(windows.y[0])]
     for u, y in zip(windows.u, windows.y[1:], strict=True):
-        x = mpc.dynamics_function(x.T, u.T, mpc.theta).full().T
+        x = mpc.plant_function(x.T, u.T, mpc.theta).full().T
         off = x / windows.scale - y
         good = (np.abs(off) < _ABSURD).all(axis=1)
         errors.append(np.where(good[:, None], off, _ABSURD))
@@ -111,14 +111,15 @@ class MultiStepProblem:
 
     def __init__(self, mpc: MPC, windows: Windows, coordinates: OneStepProblem, spread: float) -> None:
         self.windows, self.coordinates, self._spread = windows, coordinates, spread
-        f, index = mpc.dynamics_function, np.flatnonzero(coordinates.coordinates.mask)[coordinates.free]
-        x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", len(mpc.theta))
+        f, index = mpc.plant_function, np.flatnonzero(coordinates.coordinates.mask)[coordinates.free]
+        nx, nu = windows.y.shape[2], windows.u.shape[2]
+        x, u, theta = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("theta", len(mpc.theta))
         reached = ca.densify(f(x, u, theta))
         slopes = ca.jacobian(reached, theta)[:, index.tolist()]
         parts = [reached, *(ca.vec(ca.densify(part.T)) for part in (ca.jacobian(reached, x), slopes))]
         self._step = ca.Function("multi_step", [x, u, theta], parts)
         self.operations = int(self._step.n_instructions())
-        self.count = int(windows.valid.sum() + len(windows)) * mpc.nx
+        self.count = int((windows.valid.sum() + len(windows)) * nx)
 
     def simulated(self, z: Array, starts: Array, *, slopes: bool) -> _Pass:
         """All windows from their starts ``(W, nx)``; a window ends where its prediction is absurd."""

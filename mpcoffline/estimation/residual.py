@@ -6,7 +6,6 @@ miss in one step, from a part of the episodes; it is bounded by the largest resi
 
 from __future__ import annotations
 
-import copy
 import logging
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +20,7 @@ from mpcoffline.mpc import MPC
 
 from .identification import OneStepProblem, Rows, without_jumps
 from .multi_step import Windows, open_loop
+from .plant import plant_rows
 from .small_network import SmallNetwork, fit_small_network
 from .structure import HeldOut
 from .trajectories import Trajectories
@@ -39,7 +39,7 @@ _ABSURD = 1e3
 
 @dataclass(frozen=True)
 class Residual:
-    """What is added to a model's prediction: ``f(x, u) + unit * network(x, u)``.
+    """What is added to the plant's map in a model: ``f(x, u) + unit * network(x, u)``, u being the input that acts.
 
     Attributes:
         network: Maps (x, u) to the residual in spreads of the increments; None where nothing was learned.
@@ -94,11 +94,8 @@ def with_residual(mpc: MPC, residual: Residual) -> MPC:
         mpc: The MPC that the residual was fitted to.
         residual: The residual, taken or not.
     """
-    model = copy.copy(mpc.model)
-    x, u, p = ca.SX.sym("x", model.nx), ca.SX.sym("u", model.nu), ca.SX.sym("p", model.space.size)
-    reached = ca.cse(mpc.model.expression(x, u, p) + residual.expression(x, u))
-    model.function = ca.Function("model", [x, u, p], [reached], ["x", "u", "p"], ["x_next"])
-    return mpc.replace(model=model)
+    x, u = (ca.SX.sym(name, size) for name, size in (("x", len(residual.unit)), ("u", len(mpc.layout.acting))))
+    return mpc.replace(model=mpc.model.plus(ca.Function("residual", [x, u], [residual.expression(x, u)])))
 
 
 def fit_residual(mpc: MPC, table: TransitionTable, seed: int = 0) -> Residual:
@@ -125,6 +122,7 @@ def fit_residual(mpc: MPC, table: TransitionTable, seed: int = 0) -> Residual:
     Raises:
         InvalidDataError: If the data have other dimensions than the MPC.
     """
+    table = plant_rows(mpc, table)
     missed = _Missed.of(mpc, table, seed)
     judged = HeldOut.of(missed.episodes, seed).rows
     outputs = np.sqrt(np.mean(np.clip(missed.errors, -_ABSURD, _ABSURD) ** 2, axis=0)) > _LEAST
@@ -150,7 +148,7 @@ def fit_residuals(mpc: MPC, table: TransitionTable, seed: int = 0, *, count: int
     Returns:
         The residuals; none is judged (``taken`` is False).
     """
-    missed, rng = _Missed.of(mpc, table, seed), np.random.default_rng(seed)
+    missed, rng = _Missed.of(mpc, plant_rows(mpc, table), seed), np.random.default_rng(seed)
     outputs = np.sqrt(np.mean(np.clip(missed.errors, -_ABSURD, _ABSURD) ** 2, axis=0)) > _LEAST
     if not outputs.any():
         return (Residual(None, outputs, missed.unit),) * count
@@ -177,7 +175,6 @@ class _Missed:
     @classmethod
     def of(cls, mpc: MPC, table: TransitionTable, seed: int) -> _Missed:
         """On the table, or on some rows of a large one, without jumps of wrapped angles."""
-        table.check_fits(mpc.nx, mpc.nu)
         sample = table.sample(_ROWS, seed)
         columns = sample.values()
         rows = Rows(columns.observations, columns.actions, columns.next_observations)

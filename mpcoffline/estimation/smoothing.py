@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
 from .identification import identify_one_step
 from .kalman import Linearised, filtered, smoothed
+from .plant import plant_rows, state_rows
 from .trajectories import Trajectories
 
 #: Noise below this share of a coordinate's standard deviation is left in the data: it harms nothing,
@@ -117,7 +119,7 @@ def estimate_noise(mpc: MPC, table: TransitionTable, theta: Array | None = None)
     """
     found = identify_one_step(mpc, table) if theta is None else None
     parameters, unwrapped = (found.theta, found.unwrapped) if found else (np.asarray(theta, np.float64), ())
-    return noise_by_moments(Trajectories.of(mpc, excerpt(table, 0), unwrapped), parameters)
+    return noise_by_moments(Trajectories.of(mpc, excerpt(plant_rows(mpc, table), 0), unwrapped), parameters)
 
 
 def smooth(
@@ -143,8 +145,17 @@ def smooth(
         InvalidArgumentError: For a noise estimate of another size.
         StorageError: Where a memory map cannot be written.
     """
-    if noise.measurement.shape != (mpc.nx,):
-        raise InvalidArgumentError("noise", expected=f"{mpc.nx} coordinates", actual=str(noise.measurement.shape))
+    n_states = mpc.layout.n_states
+    if noise.measurement.shape != (n_states,):
+        raise InvalidArgumentError("noise", expected=f"{n_states} coordinates", actual=str(noise.measurement.shape))
+    table = state_rows(mpc, table)
+    return with_plant_states(table, smoothed_plant(mpc, plant_rows(mpc, table), theta, noise, unwrapped))
+
+
+def smoothed_plant(
+    mpc: MPC, table: TransitionTable, theta: Array, noise: NoiseEstimate, unwrapped: tuple[int, ...]
+) -> TransitionTable:
+    """As :func:`smooth`, of what the plant's map is given."""
     parts = (table.take(slice(start, start + _CHUNK)) for start in range(0, len(table), _CHUNK))
     smooth_parts = (
         part.with_states(*_smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)) for part in parts

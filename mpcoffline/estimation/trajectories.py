@@ -51,19 +51,19 @@ class Trajectories:
 
     @classmethod
     def of(cls, mpc: MPC, table: TransitionTable, unwrapped: tuple[int, ...]) -> Trajectories:
-        """Cuts the table into trajectories."""
-        table.check_fits(mpc.nx, mpc.nu)
+        """Cuts a table of what the plant's map is given into trajectories."""
+        nx = table.ny
         columns = table.values()
         s, reached, spread = columns.observations, columns.next_observations, columns.observations.std(axis=0)
         difference = _wrapped(reached[:-1] - s[1:], unwrapped)
         within = (table.episode_ids[1:] == table.episode_ids[:-1]) & (columns.terminations[:-1] == 0.0)
-        typical = np.median(np.abs(difference[within]), axis=0) if within.any() else np.zeros(mpc.nx)
+        typical = np.median(np.abs(difference[within]), axis=0) if within.any() else np.zeros(nx)
         size = 1.4826 * typical + 1e-5 * np.where(spread > 0.0, spread, 1.0)
-        goes_on = within & (np.sum((difference / size) ** 2, axis=1) <= scipy.stats.chi2(mpc.nx).isf(_CUT))
+        goes_on = within & (np.sum((difference / size) ** 2, axis=1) <= scipy.stats.chi2(nx).isf(_CUT))
         index, valid = _stretches(goes_on)
         repeated = bool((typical > 1e-6 * spread).any())
         s, reached = s[index], reached[index]
-        turns = np.zeros((*index.shape, 2, mpc.nx))
+        turns = np.zeros((*index.shape, 2, nx))
         for i in unwrapped:
             turns[:, :, 0, i] = np.unwrap(s[:, :, i], axis=1) - s[:, :, i]
             turns[:, :, 1, i] = -_FULL_TURN * np.round((reached - s - turns[:, :, 0])[:, :, i] / _FULL_TURN)

@@ -67,7 +67,8 @@ class OfflineMPCLearner:
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
             ``mpcoffline.learning.VALUE_METHODS``, or a method itself; overrides the preset.
-        value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
+        value_function: A V_phi learned before, of the same data and discount, and of the MPC's state; (VALUE) is
+            skipped, and no dead time is looked for.
         device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
         **options: Any option of the method, e.g. ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; what two stages
             have takes the name of the stage in front (``value_n_steps``, ``fit_n_steps``). ``learner.method.options``
@@ -319,7 +320,7 @@ class OfflineMPCLearner:
                 learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
                 if document["value_given"]:
                     learner._given_value_function = learner.value_function
-                if learner.value_function.ny != learner.nominal_mpc.nx:
+                if learner.value_function.ny not in (nominal.nx, (learner.mpc if document["learned"] else nominal).nx):
                     raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
         return learner
 

@@ -16,7 +16,8 @@ from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
-from .stages import Change, Stage
+from .linear_quadratic import is_linear_quadratic
+from .stages import Change, Known, Stage
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +42,8 @@ class Method(ABC):
     Attributes:
         trim: Share of the transitions that is learned from; the farthest out are left out.
         discount: gamma of V and of the learned MPC; None keeps the given MPC's.
-        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken.
+        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken: a small discount hides
+            goals that are far. A linear-quadratic MPC, which sees any distance, keeps its own.
         horizon: N of the learned MPC; None keeps the given one's.
         cross_term: Whether the quadratic stage cost gets a cross term S.
     """
@@ -63,6 +65,10 @@ class Method(ABC):
     @abstractmethod
     def stages(self) -> dict[str, Stage | Change]:
         """The stages by name, in their order; one without steps is a function from ``Known`` to ``Known``."""
+
+    def prepared(self, known: Known) -> Known:
+        """What the stages begin with, found from all transitions; by default what is known already."""
+        return known
 
     @property
     def name(self) -> str:
@@ -140,14 +146,15 @@ class Method(ABC):
 
     def restructured(self, nominal: MPC) -> MPC:
         """The MPC with the discount, the horizon and the form of stage cost that the options ask for."""
-        discount = max(nominal.discount, self.least_discount) if self.discount is None else self.discount
+        least = 0.0 if is_linear_quadratic(nominal) else self.least_discount
+        discount = max(nominal.discount, least) if self.discount is None else self.discount
         horizon = nominal.horizon if self.horizon is None else self.horizon
         mpc = nominal.replace(discount=discount, horizon=horizon)
         cost = nominal.stage_cost
         if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
             values, cross = cost.values, np.zeros((cost.nx, cost.nu))
             constant = float(values["constant"])
-            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
+            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant, values.get("D"))
             return mpc.replace(stage_cost=crossed)
         if self.cross_term:
             _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")

@@ -64,6 +64,34 @@ class FitResult:
 
 
 @dataclass(frozen=True)
+class KnownCost:
+    """How the logged costs L follow from the MPC's stage cost: ``L = scale Lhat + offset``.
+
+    Attributes:
+        scale: Positive.
+        offset: In the unit of the logged costs.
+        missed: Share of the variance of the logged costs that is not explained.
+        agreeing: Share of the transitions that it holds for.
+        constant: Whether all logged costs are one number, so that they say nothing about Lhat.
+    """
+
+    scale: float = 1.0
+    offset: float = 0.0
+    missed: float = 0.0
+    agreeing: float = 1.0
+    constant: bool = False
+
+    def __str__(self) -> str:
+        """The relation, in words."""
+        if self.constant:
+            return "L is the same in all transitions that do not end an episode"
+        relation = "Lhat" if self.scale == 1.0 else f"{self.scale:.4g} Lhat"
+        offset = f" {self.offset:+.3g}" if self.offset else ""
+        where = "" if self.agreeing == 1.0 else f" in {self.agreeing:.0%} of the transitions"
+        return f"L = {relation}{offset}{where}, up to {self.missed:.1g} of Var[L]"
+
+
+@dataclass(frozen=True)
 class Known:
     """What is known between two stages of a fit.
 
@@ -74,6 +102,7 @@ class Known:
         seed: Seeds everything.
         device: Torch device for what is large.
         value_function: V_phi, given or learned; None before.
+        cost: How the logged costs follow from the MPC's stage cost, which then is not learned; None where it is.
         model_error: What the model misses in one step, as share of an increment (root mean square); None where it was
             not identified.
         residual_share: The share of what the identified model missed that a learned residual explains; None where the
@@ -87,6 +116,7 @@ class Known:
     seed: int = 0
     device: str = "cpu"
     value_function: ValueFunction | None = None
+    cost: KnownCost | None = None
     model_error: float | None = None
     residual_share: float | None = None
     result: FitResult | None = None

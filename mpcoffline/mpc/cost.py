@@ -28,6 +28,12 @@ class QuadraticCost(Component):
     and as a terminal cost e'We + constant. Without ``S`` the matrices W and R are parameters of their own
     (the paper's form); with ``S`` the whole matrix H = [[W, S], [S', R]] is one.
 
+    With ``D`` a stage cost has a price on changes of the inputs besides (do-mpc's ``rterm``)::
+
+        (u - u_before)'D(u - u_before),        D positive semidefinite
+
+    where ``u_before`` is the input of the step before, which the MPC then carries in its state.
+
     Args:
         W: State weight, ``(nx, nx)``.
         R: Input weight, ``(nu, nu)``; without it inputs are free of cost.
@@ -35,6 +41,7 @@ class QuadraticCost(Component):
         x_ref: State reference, ``(nx,)``; zero by default.
         u_ref: Input reference, ``(nu,)``; zero by default.
         constant: The offset theta_3 of (COST).
+        D: Weight of changes of the inputs, ``(nu, nu)``; needs ``R``.
 
     Raises:
         InvalidArgumentError: If shapes do not fit, or the weights are not symmetric positive semidefinite.
@@ -50,19 +57,25 @@ class QuadraticCost(Component):
         x_ref: ArrayLike | None = None,
         u_ref: ArrayLike | None = None,
         constant: float = 0.0,
+        D: ArrayLike | None = None,
     ) -> None:
         weight = np.atleast_2d(numbers("W", W))
         nx = weight.shape[0]
         blocks: list[Block] = []
         nu = 0
         if R is None:
-            if S is not None or u_ref is not None:
-                raise InvalidArgumentError("R", expected="a matrix, as S or u_ref is given", actual="None")
+            if S is not None or u_ref is not None or D is not None:
+                raise InvalidArgumentError("R", expected="a matrix, as S, D or u_ref is given", actual="None")
             blocks.append(Block.psd("W", weight, "cost"))
         else:
             input_weight = np.atleast_2d(numbers("R", R))
             nu = input_weight.shape[0]
             blocks += _weight_blocks(weight, input_weight, S)
+            if D is not None:
+                change_weight = np.atleast_2d(numbers("D", D))
+                if change_weight.shape != (nu, nu):
+                    raise InvalidArgumentError("D", expected=f"shape {(nu, nu)}", actual=f"shape {change_weight.shape}")
+                blocks.append(Block.psd("D", change_weight, "cost"))
             blocks.append(Block.free("u_ref", vector("u_ref", u_ref, nu), "reference"))
         blocks.append(Block.free("x_ref", vector("x_ref", x_ref, nx), "reference"))
         offset = numbers("constant", constant)
@@ -89,6 +102,11 @@ class QuadraticCost(Component):
         n = len(self.W)
         return self._weights()[:n, n:]
 
+    @property
+    def uses_previous(self) -> bool:
+        """Whether changes of the inputs have a price."""
+        return "D" in self.values
+
     def _weights(self) -> Array:
         """The matrix H ``(nx + nu, nx + nu)``."""
         values = self.values
@@ -96,8 +114,22 @@ class QuadraticCost(Component):
             return values["H"]
         return scipy.linalg.block_diag(values["W"], values["R"]) if "R" in values else values["W"]
 
-    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
-        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that ``e'We = |C'e|^2``."""
+    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX], previous: ca.SX | None = None) -> ca.SX:
+        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that ``e'We = |C'e|^2``.
+
+        Args:
+            x: State, ``(nx, 1)``.
+            u: Inputs, ``(nu, 1)``.
+            p: The parameters.
+            previous: The inputs of the step before, ``(nu, 1)``; where there is no ``D``, they are not asked for.
+        """
+        cost = self._stationary(x, u, p)
+        if previous is not None and "D" in p:
+            cost = cost + ca.sumsqr(p["D"].T @ difference("u", u, previous))
+        return cost
+
+    def _stationary(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """(COST) without what changes of the inputs cost."""
         e = self._error(x, p)
         if "H" in p:
             return ca.sumsqr(p["H"].T @ ca.vertcat(e, difference("u", u, p["u_ref"]))) + p["constant"]

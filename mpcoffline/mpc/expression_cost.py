@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import casadi as ca
@@ -32,6 +32,7 @@ class ExpressionCost(Component):
 
     def __init__(self, function: ca.Function, space: ParameterSpace, *, convex: bool = False) -> None:
         self.function, self.space, self.convex = traced("cost", function), space, convex
+        self.nx = self.function.numel_in(0)
 
     def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """The stage cost as a CasADi scalar.
@@ -71,13 +72,19 @@ class ExpressionCost(Component):
 
 
 def cost_to_json(
-    cost: StageCost | TerminalCost, nx: int, nu: int | None = None, *, portable: bool = False
+    cost: StageCost | TerminalCost,
+    expression: Callable[..., ca.SX],
+    nx: int,
+    nu: int | None = None,
+    *,
+    portable: bool = False,
 ) -> dict[str, Any]:
     """A cost as its class writes it, or, where no file can name that class, by its expression.
 
     Args:
         cost: The cost.
-        nx: Number of states.
+        expression: Its value ``(x, u, p) -> L``, or ``(x, p) -> T``, in the state of the problem.
+        nx: Number of states of the problem.
         nu: Number of inputs; None for a terminal cost.
         portable: Whether classes from outside this package are written by their expression, too.
 
@@ -89,8 +96,7 @@ def cost_to_json(
         return dict(own.to_json()) | {"kind": name}
     theta = ca.SX.sym("theta", cost.space.size)
     variables = [ca.SX.sym("x", nx), *([] if nu is None else [ca.SX.sym("u", nu)])]
-    write = own.terminal_expression if nu is None else own.expression
-    value = ca.densify(ca.SX(write(*variables, cost.space.symbols(theta))))
+    value = ca.densify(ca.SX(expression(*variables, cost.space.symbols(theta))))
     function = ca.Function("cost", [*variables, theta], [value])
     return ExpressionCost(function, cost.space, convex=bool(getattr(cost, "convex", False))).to_json()
 

@@ -6,7 +6,7 @@ run foreign code. A list of arithmetic instructions cannot.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -83,6 +83,23 @@ def traced(name: str, function: ca.Function) -> ca.Function:
             hint="Use casadi.sin ... instead of math.sin, which turns symbols into NaN.",
         )
     return function
+
+
+def scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.SX:
+    """Evaluates a cost expression, turning CasADi's dimension errors into one that says what is expected.
+
+    Raises:
+        InvalidArgumentError: For an expression that fails, or is no scalar.
+    """
+    try:
+        cost = ca.densify(ca.SX(expression()))
+    except (InvalidArgumentError, RuntimeError) as error:
+        raise InvalidArgumentError(
+            name, expected=f"a cost for nx = {nx}, nu = {nu}", actual=str(error).splitlines()[-1]
+        ) from error
+    if cost.shape != (1, 1):
+        raise InvalidArgumentError(name, expected="a scalar", actual=f"shape {cost.shape}")
+    return cost
 
 
 def function_to_json(function: ca.Function) -> dict[str, Any]:

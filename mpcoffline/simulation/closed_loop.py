@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.control.course import Course
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.solvers import Plan
 
 from .ensemble import Ensemble
 from .logged_cost import LoggedCost
@@ -27,7 +29,7 @@ class Simulation:
         cost: Undiscounted cost of each episode above the cheapest logged cost, ``(members, starts)``.
         success: Whether the mean cost of the last tenth of the steps was small, ``(members, starts)``.
         lost: Whether the state ran away, ``(members, starts)``.
-        states: States with the identified model, ``(starts, T + 1, nx)``.
+        states: States with the identified model, past inputs included, ``(starts, T + 1, nx)``.
         actions: Inputs with the identified model, ``(starts, T, nu)``.
     """
 
@@ -56,7 +58,7 @@ def simulate(
         ensemble: The models.
         cost: The stage cost.
         table: The data, for scales.
-        starts: ``(starts, nx)``.
+        starts: ``(starts, nx)``: observations, and the past inputs that the table's states hold.
         n_steps: Length of an episode.
     """
     columns = table.values()
@@ -64,13 +66,17 @@ def simulate(
     reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread
     reach = np.where(spread > 0.0, reach, np.inf)
     dearest = float(columns.costs.max())
+    ny = policy.mpc.ny
     n, (s, nx) = len(ensemble), starts.shape
     x = np.broadcast_to(starts, (n, s, nx)).copy()
     lost = np.zeros((n, s), dtype=bool)
-    costs, states, actions, plan = [], [x[0].copy()], [], None
+    costs, states, actions = [], [x[0].copy()], []
+    course: Plan | Course | None = None
+    if policy.mpc.nx == nx > ny:  # the policy knows what was applied before, as it would in the midst of an episode
+        course = Course(*Plan.none(n * s, policy.mpc), x.reshape(-1, nx)[:, ny:])
     for _ in range(n_steps):
         flat = x.reshape(-1, nx)
-        u, plan = policy.predict(flat, state=plan)
+        u, course = policy.predict(flat[:, :ny], state=course)
         u = np.asarray(u, dtype=np.float64)
         stage = cost(flat, u).reshape(n, s)
         costs.append(np.where(lost, dearest, stage) - cost.low)

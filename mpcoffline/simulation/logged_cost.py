@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import gathered
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 
@@ -24,6 +25,7 @@ class LoggedCost:
     Args:
         table: The transitions; smoothed, where s is noisy.
         seed: Seeds features and split.
+        seen: How many coordinates of s the cost may depend on, the first ones; all by default.
 
     Attributes:
         r2: Share of the variance of held-out costs that it explains.
@@ -31,8 +33,10 @@ class LoggedCost:
         exact: Whether a quadratic is exact.
     """
 
-    def __init__(self, table: TransitionTable, seed: int = 0) -> None:
+    def __init__(self, table: TransitionTable, seed: int = 0, seen: int | None = None) -> None:
         rng = np.random.default_rng(seed)
+        self._seen = table.ny if seen is None else seen
+        table = table if self._seen == table.ny else gathered(table, range(self._seen))
         self._level = float(table.centring.centre[table.ny + table.nu])  # a large constant, which ridges would shrink
         train, test = table.split(1.0 - _HELD_OUT, seed) if table.n_episodes > 4 else _rows_split(table, rng)
         (x, cost), (x_test, cost_test) = (_sample(part, rng) for part in (train, test))
@@ -55,7 +59,7 @@ class LoggedCost:
 
     def __call__(self, s: Array, a: Array) -> Array:
         """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``."""
-        cost = self._regression(self._features(np.hstack([s, a])))[:, 0] + self._level
+        cost = self._regression(self._features(np.hstack([s[:, : self._seen], a])))[:, 0] + self._level
         return np.maximum(cost, self.low)
 
 

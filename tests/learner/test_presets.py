@@ -59,10 +59,17 @@ def test_an_option_has_one_spelling_and_each_comes_back(name: str) -> None:
     [("default", 0.9, 0.95), ("default", 0.97, 0.97), ("fast", 0.9, 0.95), ("best", 0.95, 0.97), ("best", 0.99, 0.99)],
 )
 def test_the_other_presets_have_a_least_discount(preset: str, given: float, discount: float) -> None:
-    mpc = make_mpc().replace(discount=given)
+    mpc = nominal_mpc(PENDULUM).replace(discount=given)
     assert PRESETS[preset].restructured(mpc).discount == discount
     assert PRESETS[preset].replaced({"discount": 0.8}).restructured(mpc).discount == 0.8
     assert mpc.discount == given
+
+
+@pytest.mark.parametrize("preset", ["default", "fast", "best"])
+def test_a_linear_quadratic_mpc_keeps_its_discount(preset: str) -> None:
+    assert PRESETS[preset].restructured(make_mpc()).discount == make_mpc().discount == 0.9
+    limited = make_mpc().replace(constraints=lambda x, u, p: x[0] - 1.0)
+    assert PRESETS[preset].restructured(limited).discount > 0.9
 
 
 def test_horizons_are_those_of_the_preset() -> None:

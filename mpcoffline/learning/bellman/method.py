@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.learning.known_cost import CostConfig, with_known_cost
 from mpcoffline.learning.method import METHODS, Method
 from mpcoffline.learning.stages import Change, Stage
 from mpcoffline.learning.value.config import ValueConfig
@@ -19,16 +20,19 @@ from .stages import LearnParameters, LearnValue, StartConfig, TerminalConfig, id
 class Bellman(Method):
     """The regressions of arXiv:2301.01667 one after the other; no MPC is solved.
 
-    In this order: identification of the model and removal of measurement noise (``init="identified"``), V_phi by
-    (VALUE), theta by (FIT), the terminal cost from V. By default all are as in :class:`~mpcoffline.learning.Paper`.
+    In this order: whether the stage cost is known, identification of the model and removal of measurement noise
+    (``init="identified"``), V_phi by (VALUE), theta by (FIT), the terminal cost from V. By default all are as in
+    :class:`~mpcoffline.learning.Paper`.
 
     Attributes:
+        cost: Whether the stage cost is learned.
         identify: Where the model starts.
         value: How V_phi is learned.
         fit: How theta is learned.
         terminal: What the terminal cost becomes.
     """
 
+    cost: CostConfig = field(default_factory=CostConfig)
     identify: StartConfig = field(default_factory=StartConfig)
     value: ValueConfig = field(default_factory=ValueConfig)
     fit: ParameterConfig = field(default_factory=ParameterConfig)
@@ -47,6 +51,7 @@ class Bellman(Method):
     def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""
         return {
+            "cost": partial(with_known_cost, config=self.cost),
             "identify": partial(identified, config=self.identify),
             "value": LearnValue(self.value),
             "fit": LearnParameters(self.fit, self.identify.adapt_above),

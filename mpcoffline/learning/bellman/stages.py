@@ -11,6 +11,8 @@ import numpy as np
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residual, identify, with_residual
+from mpcoffline.estimation.plant import settled
+from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
@@ -20,11 +22,10 @@ from mpcoffline.mpc import MPC, NormCost, TerminalCost
 from .regression import ParameterConfig, ParameterTraining
 
 Init = Literal["nominal", "identified"]
-Terminal = Literal["given", "norm", "quadratic", "network"]
+Terminal = Literal["given", "norm", "quadratic", "network", "auto"]
 
 _log = logging.getLogger(__name__)
 
-_OTHER_MAGNITUDE = 30.0
 _SCALE_ROWS = 5_000
 _TERMINAL_ROWS = 100_000
 
@@ -59,7 +60,7 @@ def identified(known: Known, config: StartConfig) -> Known:
     found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    known = replace(known, mpc=known.mpc.with_theta(found.theta), table=found.table, model_error=found.error_after)
+    known = replace(known, mpc=known.mpc.replace(model=found.model), table=found.table, model_error=found.error_after)
     return completed(known) if config.residual and found.error_after > config.adapt_above else known
 
 
@@ -110,11 +111,9 @@ class LearnParameters(Stage):
     def begin(self, known: Known) -> Training:
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
-        missed = (
-            0.0 if known.residual_share else known.model_error
-        )  # it belongs to the parameters that it was fitted with
-        mpc, config = in_units_of(known.mpc, known.table), self._adapting(missed)
-        return ParameterTraining(mpc, known.constant_value, known.table, known.groups, config, seed=known.seed)
+        mpc = known.mpc if known.cost is not None else in_units_of(known.mpc, known.table)
+        value, config = known.constant_value, self._adapting(0.0 if known.residual_share else known.model_error)
+        return ParameterTraining(mpc, value, known.table, known.groups, config, seed=known.seed, cost=known.cost)
 
     def _adapting(self, missed: float | None) -> ParameterConfig:
         """The configuration, without steps on a model that was identified and predicts well."""
@@ -144,7 +143,9 @@ class TerminalConfig:
 
     Attributes:
         method: ``"given"`` keeps the given one's, ``"norm"`` is (TERM), ``"quadratic"`` and ``"network"`` are fitted
-            to V, as Theorem 1 asks for (doi:10.1109/TAC.2019.2913768).
+            to V, as Theorem 1 asks for (doi:10.1109/TAC.2019.2913768); ``"auto"`` is the exact value of the learned
+            MPC where it has one, with an affine model and a quadratic stage cost
+            (:func:`~mpcoffline.learning.linear_quadratic.riccati_cost`), else ``"network"``.
         blend: Share of the convex quadratic in ``"network"``: steadier at short horizons.
     """
 
@@ -157,17 +158,23 @@ class TerminalConfig:
 
 
 def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
-    """The MPC with the terminal cost that is asked for: T = V - Phi, or none from V."""
-    kind = config.method
-    if kind == "given":
+    """The MPC with the terminal cost that is asked for: T = V - Phi, or none from V.
+
+    The exact value of an MPC is V - Phi of its own: Phi changes none of its inputs.
+    """
+    if config.method == "given":
         return known
-    goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
-    cost: TerminalCost = NormCost(goal)
-    if kind != "norm":
+    goal = settled(known.mpc, known.table)
+    exact = riccati_cost(known.mpc) if config.method == "auto" else None
+    cost: TerminalCost = NormCost(goal) if exact is None else exact
+    if exact is not None:
+        _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")
+    elif config.method != "norm":
         value, potential = known.constant_value, None if known.result is None else known.result.potential
+        scale = 1.0 if known.cost is None else known.cost.scale
         cost = fit_terminal(
-            kind,
-            value if potential is None else lambda s: value(s) - potential(s),
+            "quadratic" if config.method == "quadratic" else "network",
+            lambda s: (value(s) if potential is None else value(s) - potential(s)) / scale,
             known.table.sample(_TERMINAL_ROWS, 0).observations,
             x_ref=goal,
             blend=config.blend,
@@ -178,20 +185,21 @@ def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
 
 
 def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
-    """The MPC with the weights of its stage cost scaled to the logged cost, where these are of other magnitudes.
+    """The MPC with the weights of its stage cost scaled to the logged cost, which has its unit from whoever logged it.
 
-    (FIT) measures distances in the size of theta_0, which has to be that of the cost in the data within a factor of 30.
+    (FIT) is drawn to theta_0, of which the ratios of the weights count, not their size.
     """
     rows = table.sample(_SCALE_ROWS, 0)  # at random: a stride would meet the length of episodes
     stage = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full()
     logged, nominal = float(rows.costs.std(dtype=np.float64)), float(stage.std())
     factor = logged / nominal if nominal > 0.0 else 1.0
-    if not np.isfinite(factor) or 1.0 / _OTHER_MAGNITUDE < factor < _OTHER_MAGNITUDE or factor == 0.0:
+    if not np.isfinite(factor) or factor == 0.0:
         return mpc
     weights = [block.name for block in mpc.space if block.group == "cost" and block.kind == "psd"]
     theta = mpc.theta
     for name in weights:
         theta[mpc.space.slices[name]] *= np.sqrt(factor)  # of W = C C'
-    outcome = f"{', '.join(weights)} scaled to it" if weights else "scale that by hand"
-    _log.warning("the logged cost varies %.3g times as much as the MPC's stage cost: %s", factor, outcome)
+    _log.info(
+        "the logged cost varies %.3g times as much as the MPC's stage cost, whose weights are scaled to it", factor
+    )
     return mpc.with_theta(theta)

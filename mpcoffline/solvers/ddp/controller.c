@@ -33,7 +33,7 @@ static void start(const mpc_problem *m, lanes *w, int c) {
     if (race.max_iterations > RACE_ITERATIONS) race.max_iterations = RACE_ITERATIONS;
     for (int k = 0; k < MPC_HORIZON; ++k)
         for (int a = 0; a < NU; ++a) w->u[k * NU + a] = clip(candidate(c, k, a), m->low[a], m->high[a]);
-    w->J = rollout_open(m, w, w->x, w->u);
+    w->J = rollout_open(m, w, w->x, w->u, &w->size);
     solve(&race, w);
     if (!(w->J < INFINITY)) w->J = INFINITY;
 }
@@ -48,7 +48,7 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     for (int c = 0; c < N_CANDIDATES; ++c) {
         for (int k = 0; k < MPC_HORIZON; ++k)
             for (int a = 0; a < NU; ++a) w->u[k * NU + a] = candidate(c, k, a);
-        J[c] = rollout_open(m, w, w->x, w->u);
+        J[c] = rollout_open(m, w, w->x, w->u, &w->size);
         if (!(J[c] < INFINITY)) J[c] = INFINITY;
     }
     for (int l = 0; l < MPC_STARTS; ++l) {
@@ -78,7 +78,7 @@ void mpc_reset(mpc_state *state) { state->has_plan = 0; }
 static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
     for (int i = 0; i < MPC_HORIZON * NU; ++i) w->u[i] = clip(state->u[i], low[i % NU], high[i % NU]);
     for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w->x[i] = i < NX ? w->s[i] : state->x[i];
-    w->J = INFINITY;
+    w->J = w->size = INFINITY;
     int status = solve(m, w), found = status != NOT_FINITE;
     double J = found ? w->J : INFINITY;
     if (status == CONVERGED) {
@@ -95,7 +95,7 @@ static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
 }
 
 int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NX], double u[MPC_NU]) {
-    const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, MPC_MAX_ITERATIONS, TOLERANCE};
+    const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, MPC_MAX_ITERATIONS, TOLERANCE};
     const double *theta = (const double *)parameters;
     lanes w;
     int answer;

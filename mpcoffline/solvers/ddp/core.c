@@ -20,6 +20,8 @@
  * Nothing here knows how many lanes there are: vd is one double or a vector of them, vl the result of comparing them.
  *
  * No lane looks at another: a problem's result is the same to the bit whatever is solved next to it.
+ *
+ * No unit matters: costs are compared with the size of their own terms, inputs with those of the plan or their range.
  */
 #include <stdint.h>
 
@@ -32,13 +34,17 @@ enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING 
 #define ARMIJO 1e-4
 #define SHORTEST_STEP 0.5 /* of those tried first, when two steps in a row suggest a length other than 1 */
 #define LONGEST_STEP 5.0
-#define INPUT_TOLERANCE 3e-5
+#define INPUT_TOLERANCE 3e-5 /* of the first input, relative to the largest of the plan, */
+#define LEAST_INPUT 1e-6     /* which counts as at least this part of the range */
+#define DEFECT_TOLERANCE 1e2 /* times the tolerance is what defects of the model may cost */
+#define ROUNDING 1e-15       /* of the states in a step, relative */
 #define ACCEPTABLE 1e3 /* times the tolerance is good enough once the iterations are used up */
-#define RIDGE 1e-12   /* keeps a singular Quu (an input that nothing depends on) invertible */
+#define RIDGE 1e-12   /* keeps a singular Quu invertible, relative to its rows */
+#define TINY 1e-290   /* keeps one that is zero so, where nothing depends on an input */
 #define RACE_ITERATIONS 3 /* of each start of a cold solve, before the best go on */
 #define FINALISTS(starts) (((starts) + 3) / 4)
-#define DISTINCT 1e-2     /* starts whose costs differ by less, relative to 1 + |J|, most often lead to the same minimum */
-#define BEATEN 1e-4 /* relative to 1 + |J|: a solution better by less is not worth further iterations */
+#define DISTINCT 1e-2     /* starts whose costs differ by less, relative to |J|, most often lead to the same minimum */
+#define BEATEN 1e-4 /* relative to |J|: a solution better by less is not worth further iterations */
 #define NT (NX * (NX + 1) / 2)
 #define NZ (NX + NU)
 #define TRI(i, j) ((j) * ((j) + 1) / 2 + (i)) /* of an upper triangle, i <= j */
@@ -47,15 +53,19 @@ typedef struct {
     int64_t horizon;
     double discount;
     const double *low, *high; /* (NU) */
+    const double *unit;       /* (NU): sizes of the inputs against each other */
     int64_t max_iterations;
-    double tolerance;         /* on the predicted decrease, relative to 1 + |J| */
+    double tolerance;         /* on the predicted decrease, relative to the sum of the magnitudes of the costs */
 } mpc_problem;
 
 typedef struct {
     vd *x, *u, *x_new, *u_new; /* (N+1, NX), (N, NU) */
     vd *k, *K;                 /* feedforward (N, NU), feedback (N, NU, NX) column-major */
     vd p[NP + NQ + 1], s[NX], low0[NU], high0[NU];
-    vd J, J_new, mu, predicted, defect;
+    vd J, J_new, mu, predicted;
+    vd size, size_new;         /* J with the magnitudes of all costs */
+    vd defect, hidden;         /* what the defects cost; the change of J that rounding of the states makes */
+    vd largest[NU];            /* magnitude of the plan's inputs */
     vd alpha, stretch;         /* length of the last step, 0 at first; the one that two steps in a row suggest */
     vl settled; /* lanes whose first input has settled */
     vl pd; /* lanes whose backward pass found a positive definite Quu */
@@ -66,23 +76,26 @@ static inline vl no_lanes(void) { return vd_lt(V(0.0), V(0.0)); }
 
 static inline vd clip(vd a, vd low, vd high) { return vd_min(vd_max(a, low), high); }
 
-/* x+ and J along (x, u) -> open-loop states from s; returns the cost. */
-static vd rollout_open(const mpc_problem *m, const lanes *w, vd *x, const vd *u) {
+/* x+ and J along (x, u) -> open-loop states from s; returns the cost, and sets its size. */
+static vd rollout_open(const mpc_problem *m, const lanes *w, vd *x, const vd *u, vd *size) {
     vd J = V(0.0), out[NX + 1];
+    *size = V(0.0);
     double weight = 1.0;
     for (int i = 0; i < NX; ++i) x[i] = w->s[i];
     for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
         gen_step(x + k * NX, u + k * NU, w->p, out);
         for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
         J += weight * out[NX];
+        *size += weight * vd_abs(out[NX]);
     }
     gen_final(x + m->horizon * NX, w->p, out);
+    *size += weight * vd_abs(out[0]);
     return J + weight * out[0];
 }
 
-/* The closed-loop rollout of a step of length alpha (per lane) into x_new, u_new; sets J_new. */
+/* The closed-loop rollout of a step of length alpha (per lane) into x_new, u_new; sets J_new, size_new. */
 static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
-    vd J = V(0.0), out[NX + 1], *x = w->x_new;
+    vd J = V(0.0), size = V(0.0), out[NX + 1], *x = w->x_new;
     double weight = 1.0;
     for (int i = 0; i < NX; ++i) x[i] = w->s[i];
     for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
@@ -98,9 +111,11 @@ static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
         gen_step(x + k * NX, u, w->p, out);
         for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
         J += weight * out[NX];
+        size += weight * vd_abs(out[NX]);
     }
     gen_final(x + m->horizon * NX, w->p, out);
     w->J_new = J + weight * out[0];
+    w->size_new = size + weight * vd_abs(out[0]);
 }
 
 /* H = L D L' of a matrix, in place: 1/D on the diagonal, L below it. Clears lanes that are not positive definite. */
@@ -306,21 +321,30 @@ static void backward(const mpc_problem *m, lanes *w) {
     for (int64_t k = 1; k < N; ++k) weight *= m->discount;
     vd discount = V(m->discount), square = V(0.0), change = V(0.0);
     w->pd = all_lanes();
-    w->predicted = w->defect = V(0.0);
+    vd predicted = V(0.0), defect = V(0.0), largest[NU];
+    double ratio[NU][NU], ridge[NU];
+    int guessed = vl_any(~vd_lt(w->J, V(INFINITY))); /* trajectories that came without a cost need not obey the model */
+    for (int a = 0; a < NU; ++a) {
+        largest[a] = V(0.0);
+        ridge[a] = RIDGE / m->unit[a];
+        for (int b = 0; b < NU; ++b) ratio[a][b] = m->unit[b] / m->unit[a];
+    }
     for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
         const vd *u = w->u + k * NU;
         expand_stage(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
         const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NT, *Quu = Qux + NU * NX;
-        for (int i = 0; i < NX; ++i) w->defect = vd_max(w->defect, vd_abs(out[i]));
-        /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. */
+        for (int i = 0; i < NX && guessed; ++i) defect += weight * m->discount * vd_abs(Vx[i] * out[i]);
+        /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. An
+         * input without any curvature goes to its bounds, or stays if nothing depends on it. */
         vd H[NU][NU], low[NU], high[NU], d[NU], F[NU][NU];
         for (int a = 0; a < NU; ++a) {
             vd size = V(0.0);
             for (int b = 0; b < NU; ++b) {
                 H[a][b] = Quu[b * NU + a];
-                size += vd_abs(H[a][b]);
+                size += ratio[a][b] * vd_abs(H[a][b]);
             }
-            H[a][a] += (w->mu + RIDGE) * size + RIDGE;
+            H[a][a] += (w->mu + RIDGE) * size + (ridge[a] * vd_abs(Qu[a]) + TINY);
+            largest[a] = vd_max(largest[a], vd_abs(u[a]));
             low[a] = (k ? V(m->low[a]) : w->low0[a]) - u[a];
             high[a] = (k ? V(m->high[a]) : w->high0[a]) - u[a];
         }
@@ -350,7 +374,7 @@ static void backward(const mpc_problem *m, lanes *w) {
                 for (int b = 0; b < NU; ++b) M[a][i] += Quu[b * NU + a] * K[i * NU + b];
             }
         }
-        w->predicted -= weight * (slope + half);
+        predicted -= weight * (slope + half);
         for (int i = 0; i < NX; ++i) {
             Vx[i] = Qx[i];
             for (int a = 0; a < NU; ++a) Vx[i] += K[i * NU + a] * gradient[a] + Qux[i * NU + a] * d[a];
@@ -361,6 +385,10 @@ static void backward(const mpc_problem *m, lanes *w) {
             }
         }
     }
+    vd hidden = V(0.0);
+    for (int i = 0; i < NX; ++i) hidden += vd_abs(Vx[i] * w->s[i]);
+    w->predicted = predicted, w->defect = defect, w->hidden = (ROUNDING * N) * hidden;
+    for (int a = 0; a < NU; ++a) w->largest[a] = largest[a];
     w->stretch = stretch(w->alpha, square, change);
 }
 
@@ -375,7 +403,7 @@ static inline void choose_finalists(const double *J, int64_t n, int64_t *chosen)
                 int fits = !distinct || J[i] < INFINITY;
                 for (int64_t c = 0; c < n_chosen && fits; ++c) {
                     double other = J[chosen[c]];
-                    fits = i != chosen[c] && (!distinct || fabs(J[i] - other) > DISTINCT * (1.0 + fabs(other)));
+                    fits = i != chosen[c] && (!distinct || fabs(J[i] - other) > DISTINCT * fabs(other));
                 }
                 if (fits && (best < 0 || J[i] < J[best])) best = i;
             }
@@ -394,7 +422,7 @@ static inline int64_t start_of(int64_t share, int64_t n_starts, const double *J,
 
 /* Whether a plan of cost J goes before the best so far: a converged one that is as good goes before one that is not. */
 static inline int goes_before(double J, int converged, double best, int best_converged) {
-    double slack = BEATEN * (1.0 + (best < 0 ? -best : best));
+    double slack = BEATEN * (best < 0 ? -best : best);
     int closer = converged && !best_converged && J < best + slack;
     return closer || J < best - (converged == best_converged ? 0.0 : slack) || !(best < INFINITY);
 }
@@ -402,6 +430,7 @@ static inline int goes_before(double J, int converged, double best, int best_con
 /* Takes over the new trajectory where the mask says so. */
 static void accept(const mpc_problem *m, lanes *w, vl mask) {
     w->J = vd_select(mask, w->J_new, w->J);
+    w->size = vd_select(mask, w->size_new, w->size);
     if (!vl_any(~mask)) {
         vd *x = w->x, *u = w->u;
         w->x = w->x_new, w->u = w->u_new;
@@ -415,7 +444,7 @@ static void accept(const mpc_problem *m, lanes *w, vl mask) {
 
 /* Lanes that Gauss-Newton, where it creeps, has brought near enough to a solution. */
 static vl acceptable(const mpc_problem *m, const lanes *w) {
-    return w->settled & vd_lt(w->predicted, ACCEPTABLE * m->tolerance * (1.0 + vd_abs(w->J)));
+    return w->settled & vd_le(w->predicted, ACCEPTABLE * m->tolerance * w->size);
 }
 
 /* One iteration: backward pass, line search, regularisation. Lanes that are not wanted may be left where they are.
@@ -425,12 +454,19 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
     /* The cost can be flat where the policy is not: the first input must have settled too. */
     vl settled = all_lanes();
     vd far = vd_max(w->stretch, V(1.0)); /* how much farther than the step the solution is */
-    for (int a = 0; a < NU; ++a) settled &= vd_le(far * vd_abs(w->k[a]), INPUT_TOLERANCE * (1.0 + vd_abs(w->u[a])));
+    for (int a = 0; a < NU; ++a) {
+        double range = m->high[a] - m->low[a], least = range < INFINITY ? LEAST_INPUT * range : 0.0;
+        vd size = clip(w->largest[a], V(least), V(range));
+        settled &= vd_le(far * vd_abs(w->k[a]), INPUT_TOLERANCE * size);
+    }
+    vl at_rest = vd_le(w->size, w->hidden); /* nothing but rounding is left of the cost */
+    settled |= at_rest;
     /* A step found with heavy regularisation promises little without being near a solution. */
     settled &= w->pd & vd_le(w->mu, V(1.0));
     w->settled = settled;
     /* A point is a solution when the model holds and the quadratic model promises no further decrease. */
-    vl small = settled & vd_lt(vd_abs(w->J), V(INFINITY)) & vd_lt(w->predicted, m->tolerance * (1.0 + vd_abs(w->J)));
+    vl small = settled & vd_lt(vd_abs(w->J), V(INFINITY)) &
+               (vd_le(w->predicted, m->tolerance * w->size) | at_rest);
     vl open = all_lanes();
     vd alpha = vd_select(vd_le(w->mu, V(0.0)) & ~small, w->stretch, V(1.0));
     w->alpha = V(0.0);
@@ -447,7 +483,8 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
         alpha = vd_select(vd_lt(V(1.0), alpha), V(1.0), 0.4 * alpha);
     }
     /* A warm start that obeys the model is as good as a rollout, only its cost is not known before the step. */
-    vl nearly = vd_lt(w->defect, V(1e-9)) & vd_lt(w->predicted, m->tolerance * (1.0 + vd_abs(w->J)));
+    vl nearly = vd_le(w->defect, DEFECT_TOLERANCE * m->tolerance * w->size) &
+                vd_le(w->predicted, m->tolerance * w->size);
     *converged = small | (nearly & *moved & settled);
     vd less = vd_select(vd_lt(V(MU_MIN), 0.2 * w->mu), 0.2 * w->mu, V(0.0));
     vd more = vd_select(vd_lt(V(0.0), w->mu), 8.0 * w->mu, V(MU_FIRST));

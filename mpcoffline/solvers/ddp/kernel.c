@@ -34,6 +34,7 @@ typedef struct {
     const double *x0, *theta, *u0; /* (n, NX), (n, NP) or (NP), (n, NU) or NULL */
     int64_t theta_stride;          /* NP, or 0: one theta for all */
     double *x, *u, *J, *predicted; /* solution: (n, N+1, NX), (n, N, NU), (n), (n) */
+    double *size;                  /* (n), or NULL: of the costs of a ROLLOUT */
     int64_t *iterations, *status;  /* (n) */
     int guess;                       /* PLAN, INPUTS, or ROLLOUT */
     const double *x_guess, *u_guess; /* as x, u, and may be these */
@@ -66,6 +67,7 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
         for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
     for (int j = 0; j < NX; ++j) w->x[j][lane] = w->s[j][lane];
     w->J[lane] = b->guess == ROLLOUT ? b->J[i] : INFINITY;
+    w->size[lane] = b->guess == ROLLOUT ? b->size[i] : INFINITY;
     w->mu[lane] = w->alpha[lane] = 0.0;
 }
 
@@ -88,6 +90,7 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
     for (int64_t k = 0; k < n_u; ++k) u[k] = w->u[k][lane];
     for (int64_t k = 0; k < n_x; ++k) x[k] = w->x[k][lane];
     b->J[i] = w->J[lane];
+    if (b->size) b->size[i] = w->size[lane];
     int finite = is_finite(b->J + i, 1) && is_finite(u, n_u) && is_finite(x, n_x);
     b->predicted[i] = w->predicted[lane];
     b->status[i] = finite ? status : NOT_FINITE;
@@ -96,7 +99,7 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
 
 /* Whether what a start has reached and what it promises are no better than a solution of the same problem. */
 static int is_beaten(const lanes *w, int lane, double best) {
-    return best < INFINITY && !(w->J[lane] - 2.0 * w->predicted[lane] < best - BEATEN * (1.0 + fabs(best)));
+    return best < INFINITY && !(w->J[lane] - 2.0 * w->predicted[lane] < best - BEATEN * fabs(best));
 }
 
 /* Solves problems first, first + stride, ... of the batch; a lane that finishes takes the next one. */
@@ -125,9 +128,10 @@ static void solve_range(const mpc_problem *m, const mpc_batch *b, lanes *w, int6
         if (!busy) break;
         if (fresh_any && b->theta_stride) gen_prepare(w->p, w->p + NP);
         if (fresh_any && b->guess == INPUTS) {
-            vd J = rollout_open(m, w, w->x_new, w->u);
+            vd size, J = rollout_open(m, w, w->x_new, w->u, &size);
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
             w->J = vd_select(fresh, J, w->J);
+            w->size = vd_select(fresh, size, w->size);
         }
         vl wanted = no_lanes(), converged, moved, stalled;
         for (int l = 0; l < LANES; ++l) wanted[l] = -(problem[l] >= 0);
@@ -157,7 +161,7 @@ static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, co
     for (int64_t c = 0; c < n_candidates; c += LANES) {
         for (int l = 0; l < LANES; ++l)
             for (int64_t k = 0; k < size; ++k) w->u[k][l] = u0 && k < NU ? u0[k] : candidates[(c + l) * size + k];
-        vd cost = rollout_open(m, w, w->x, w->u);
+        vd size, cost = rollout_open(m, w, w->x, w->u, &size);
         for (int l = 0; l < LANES; ++l) J[c + l] = cost[l] < INFINITY ? cost[l] : INFINITY;
     }
 }
@@ -208,6 +212,7 @@ static void race(const mpc_problem *m, mpc_batch *starts, lanes *w, int64_t *cho
         for (int64_t c = l; c < FINALISTS(starts->n); ++c) /* a later finalist that is here goes to where this one was */
             if (chosen[c] == l) chosen[c] = from;
         swap(starts->J + l, starts->J + from, 1);
+        swap(starts->size + l, starts->size + from, 1);
         swap(starts->u + l * N * NU, starts->u + from * N * NU, N * NU);
         swap(starts->x + l * (N + 1) * NX, starts->x + from * (N + 1) * NX, (N + 1) * NX);
     }
@@ -242,7 +247,7 @@ static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, cons
 
 int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candidates, int64_t n_candidates,
                    int64_t n_starts, int64_t first, int64_t stride) {
-    int64_t N = m->horizon, row = (N + 1) * NX + N * NU + NX + NU + 2;
+    int64_t N = m->horizon, row = (N + 1) * NX + N * NU + NX + NU + 3;
     double *memory = calloc(n_starts * row + n_candidates, sizeof(double));
     int64_t *flags = calloc(3 * n_starts, sizeof(int64_t));
     lanes *w = lanes_new(N);
@@ -255,7 +260,8 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
         starts.x0 = q; q += n_starts * NX;
         starts.u0 = b->u0 ? q : NULL; q += n_starts * NU;
         starts.J = q; q += n_starts;
-        starts.predicted = q;
+        starts.predicted = q; q += n_starts;
+        starts.size = q;
         for (int64_t i = first; i < b->n; i += stride)
             solve_cold(m, b, i, candidates, n_candidates, memory, w, &starts, flags + 2 * n_starts);
     }

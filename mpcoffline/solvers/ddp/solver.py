@@ -17,6 +17,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import SOLVERS, Plan, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
+from mpcoffline.solvers.scaling import cost_constant, input_units
 from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
 from mpcoffline.solvers.status import Stats, Status
 
@@ -35,6 +36,7 @@ class _Problem(ctypes.Structure):
         ("discount", c_double),
         ("low", c_void_p),
         ("high", c_void_p),
+        ("unit", c_void_p),
         ("max_iterations", c_int64),
         ("tolerance", c_double),
     )
@@ -53,6 +55,7 @@ class _Batch(ctypes.Structure):
         ("u", c_void_p),
         ("J", c_void_p),
         ("predicted", c_void_p),
+        ("size", c_void_p),  # NULL, as here: nobody asks
         ("iterations", c_void_p),
         ("status", c_void_p),
         ("guess", c_int),  # 0, as here: a plan that need not obey the model
@@ -85,8 +88,8 @@ class DDPSolver(Solver):
     Args:
         mpc: The problem; without constraints other than input bounds.
         max_iterations: Bound on the iterations of a problem.
-        tolerance: Predicted decrease of the cost, relative to ``1 + |V|``, below which a problem is solved; 1000 times
-            as much where the iterations are used up.
+        tolerance: Predicted decrease of the cost, relative to the magnitudes of its stages (their constants left out),
+            below which a problem is solved; 1000 times as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
         n_threads: Threads that share a batch; a batch of up to eight problems uses one.
 
@@ -122,9 +125,18 @@ class DDPSolver(Solver):
         library.mpc_solve_cold.argtypes = (problem, batch, c_void_p, c_int64, c_int64, c_int64, c_int64)
         self._library = library
         self._low, self._high = (np.ascontiguousarray(b, dtype=np.float64) for b in (mpc.action_low, mpc.action_high))
+        self._unit = input_units(mpc)
         self._problem = _Problem(
-            mpc.horizon, mpc.discount, self._low.ctypes.data, self._high.ctypes.data, max_iterations, tolerance
+            mpc.horizon,
+            mpc.discount,
+            self._low.ctypes.data,
+            self._high.ctypes.data,
+            self._unit.ctypes.data,
+            max_iterations,
+            tolerance,
         )
+        self._constant = cost_constant(mpc)
+        self._own_constant = float(self._constant(self._theta))
         compared = n_starts if is_convex(mpc) else N_CANDIDATES  # any start leads to the only minimum
         self._candidates = np.ascontiguousarray(candidate_inputs(mpc)[:compared])
         self._starts = _address(self._candidates), len(self._candidates), n_starts
@@ -147,7 +159,12 @@ class DDPSolver(Solver):
             "all_starts": result.get("all_starts", warm_start is None),
         }
         ended = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
-        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], result["J"], status == 0, ended, stats)
+        value = result["J"]
+        if theta is not self._theta:
+            value = value + self._constant(theta.T).full()[0]
+        elif self._own_constant:
+            value = value + self._own_constant
+        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], value, status == 0, ended, stats)
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""

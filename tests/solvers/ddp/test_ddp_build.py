@@ -200,12 +200,12 @@ static double uniform(void) {
 int main(void) {
     enum { n = 21, N = 15, M = 64 };
     static double x0[n * NX], theta[n * NP + 1], u0[n * NU], x[n * (N + 1) * NX], u[n * N * NU], J[n], predicted[n];
-    static double low[NU], high[NU], candidates[M * N * NU];
+    static double low[NU], high[NU], unit[NU], candidates[M * N * NU];
     static int64_t iterations[n], status[n];
     static const double given[] = {THETA};
-    for (int a = 0; a < NU; ++a) { low[a] = -0.5 - 0.1 * a; high[a] = 0.7; }
+    for (int a = 0; a < NU; ++a) { low[a] = -0.5 - 0.1 * a; high[a] = 0.7; unit[a] = 1.0 + a; }
     for (int k = 0; k < M * N * NU; ++k) candidates[k] = 0.5 * uniform();
-    mpc_problem problem = {N, 0.95, low, high, 50, 1e-10};
+    mpc_problem problem = {N, 0.95, low, high, unit, 50, 1e-10};
     int solved = 0;
     for (int round = 0; round < 4; ++round) {
         double size = round < 3 ? 2.0 : 1e200;
@@ -214,8 +214,8 @@ int main(void) {
         for (int i = 0; i < n; ++i)
             for (int k = 0; k < NP; ++k) theta[i * NP + k] = given[k];
         int64_t stride = round % 3 ? NP : 0;
-        mpc_batch batch = {n, x0, theta, round % 2 ? u0 : NULL, stride, x, u, J, predicted, iterations, status, 0,
-                           x, u};
+        mpc_batch batch = {n, x0, theta, round % 2 ? u0 : NULL, stride, x, u, J, predicted, NULL, iterations, status,
+                           0, x, u};
         for (int64_t part = 0; part < 2; ++part)
             if (mpc_solve_cold(&problem, &batch, candidates, M, 8, part, 2)) return 1;
         for (int k = 0; k < n * NX; ++k) x0[k] += 0.1 * uniform();
