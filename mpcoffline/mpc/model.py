@@ -202,6 +202,17 @@ class Model(Component):
         other._lay_out(self.layout.with_previous(), self.plant)
         return other
 
+    def plus(self, addition: ca.Function) -> Self:
+        """The same model with something added to the plant's map, which is a discrete one then.
+
+        Args:
+            addition: A CasADi function ``(x, u) -> (n_states, 1)`` of the plant's states and the inputs that act.
+        """
+        x, u, theta = (ca.SX.sym(name, *self.plant.size_in(i)) for i, name in enumerate("xup"))
+        other = copy.copy(self)
+        other._take(ca.Function("dynamics", [x, u, theta], [self.plant(x, u, theta) + addition(x, u)]), "map", None)
+        return other
+
     def _first_scheme(self, ode: ca.Function, asked: Scheme | None) -> Scheme:
         """The scheme asked for, else the exponential of an affine ODE, else one RK4 step until more is known."""
         if asked is not None and asked.kind == "rk4":
