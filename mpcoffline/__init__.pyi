@@ -31,6 +31,7 @@ from .mpc import (
     Parameter as Parameter,
     Penalty as Penalty,
     QuadraticCost as QuadraticCost,
+    Signal as Signal,
     StateBounds as StateBounds,
 )
 from .plants import nominal_mpc as nominal_mpc
