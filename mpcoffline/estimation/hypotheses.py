@@ -32,12 +32,13 @@ _BESIDE_LINEAR = 1.5  # or: as well as a regression, which knows no physics
 _FLOOR = 0.1  # errors below are good, whatever they are
 _COST_FLOOR = 0.3
 _NO_COST = 0.8  # of the costs' spread
-_GAIN = np.log(3.0)
+_GAIN = np.log(4.0)
 _WORSE = np.log(1.5)
 _FAR = 2.5  # scaled coordinates: parameters off by a factor 12
 _TRIED, _TRIED_HEAVY = 10, 4
 _PRIOR = 1e-3
 _ITERATIONS, _ITERATIONS_HEAVY = 8, 4
+_PATIENCE = 6
 _HEAVY = 1_500  # instructions of the map, as of many substeps
 _MOST_PARAMETERS = 100
 _FAILED = 1e3
@@ -108,6 +109,7 @@ def model(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     if plain.good[: mpc.ny].all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
         yield from _late(judge, reading, plain)
         return
+    plain = judge.identified(reading, _PATIENCE)  # it may not have come to its end
     guesses = _promising(judge, reading, _guesses(mpc))
     found = [(guess, judge.identified(guess.read(reading))) for guess in guesses]
     found += [(_sampled(mpc.model.dt, k), _Judge(each, reading).identified(reading)) for k, each in _faster(mpc)]
@@ -205,8 +207,8 @@ class _Judge:
             for part, r in zip(parts, readings, strict=True)
         ]
 
-    def identified(self, reading: Reading) -> Judged:
-        """Errors with the best parameters within their bounds."""
+    def identified(self, reading: Reading, patience: int = 1) -> Judged:
+        """Errors with the best parameters within their bounds, found in ``patience`` times the usual iterations."""
         problem, moved = self._on(reading), 0.0
         errors = problem.errors(self._mpc.theta)
         rows, _ = without_jumps(problem.rows, errors * problem.scale)  # wrapped angles
@@ -214,7 +216,7 @@ class _Judge:
         errors = problem.errors(self._mpc.theta)
         if self._adapts:
             try:
-                z = problem.descend(np.zeros(problem.free.size), _PRIOR, self._iterations).z
+                z = problem.descend(np.zeros(problem.free.size), _PRIOR, patience * self._iterations).z
             except InvalidDataError:  # the reading is none that the model can take
                 pass
             else:
