@@ -14,7 +14,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.expressions import Instruction, expanded
 from mpcoffline.solvers.linear_quadratic import promises_convexity
-from mpcoffline.solvers.scaling import without_constants
+from mpcoffline.solvers.scaling import costs_of
 
 from .elimination import arithmetic, value_and_jacobian
 
@@ -81,7 +81,7 @@ def generated(mpc: MPC) -> str:
     curvature, discount = ca.SX.sym("Vxx", mpc.nx * (mpc.nx + 1) // 2), ca.SX.sym("discount")
     z = ca.vertcat(x, u)
     reached = mpc.dynamics_function(x, u, theta)
-    cost, final, _ = without_constants(mpc, x, u, theta)
+    cost, final, *_ = costs_of(mpc, x, u, theta)
     _check_size(mpc, ca.vertcat(reached, cost, final))
     final_hessian, final_gradient = ca.hessian(final, x)
     hessian, slope = ca.hessian(cost, z)
