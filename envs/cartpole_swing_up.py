@@ -62,11 +62,13 @@ PLANT = Plant(
     ),
     inputs=(Input("u", "u", "N", -MAX_FORCE, MAX_FORCE, quantity="force"),),
     parameters=(
-        Parameter("m_c", 0.2, 0.01, 100.0, "kg", spread=0.1),
-        Parameter("mu", 0.5, 0.0, max_friction, "N s/m", spread=0.25),
-        Parameter("m_p", 0.2, 0.01, 100.0, "kg", spread=0.1),
-        Parameter("l", 0.5, 0.05, 20.0, "m", spread=0.25),
-        Parameter("g", 9.8, 0.0, 30.0, "m/s^2"),
+        Parameter("m_c", 0.2, 0.01, 100.0, "kg", spread=0.1, meaning="mass of the cart"),
+        Parameter(
+            "mu", 0.5, 0.0, max_friction, "N s/m", spread=0.25, meaning="friction of the cart, 0 to $40(m_c + m_p/4)$"
+        ),
+        Parameter("m_p", 0.2, 0.01, 100.0, "kg", spread=0.1, meaning="mass of the pole"),
+        Parameter("l", 0.5, 0.05, 20.0, "m", spread=0.25, meaning="half the length of the pole"),
+        Parameter("g", 9.8, 0.0, 30.0, "m/s^2", meaning="gravity"),
     ),
     dynamics=dynamics,
     cost=cost,
@@ -99,36 +101,6 @@ class CartPoleSwingUpEnv(ControlTask):
     with $\varphi = 0$ upright and positive clockwise in the picture; integrated with one Runge-Kutta (RK4) step of
     $dt = 0.05$ s, the force held.
 
-    ## Action Space
-    `Box(-2.0, 2.0, (1,), float32)`. An action beyond the bounds is clipped to them.
-
-    | Num | Action                             | Min  | Max | Unit |
-    |-----|------------------------------------|------|-----|------|
-    | 0   | force $u$ on the cart, to the right | -2.0 | 2.0 | N    |
-
-    ## Observation Space
-    `Box([-1000, -200, -1, -1, -500], [1000, 200, 1, 1, 500], (5,), float32)`. The bounds hold for any state that 100
-    steps of the default plant can reach from `state_space`; in longer episodes position and speeds saturate at them.
-
-    | Num | Observation    | Min     | Max    | Unit  |
-    |-----|----------------|---------|--------|-------|
-    | 0   | $x$            | -1000.0 | 1000.0 | m     |
-    | 1   | $\dot x$       | -200.0  | 200.0  | m/s   |
-    | 2   | $\cos\varphi$  | -1.0    | 1.0    |       |
-    | 3   | $\sin\varphi$  | -1.0    | 1.0    |       |
-    | 4   | $\dot\varphi$  | -500.0  | 500.0  | rad/s |
-
-    ## State Space
-    The state $s = [x, \dot x, \varphi, \dot\varphi]$ is in `info["state"]`; `state_space`, a `Box(float64)`, holds
-    the states that `reset` accepts.
-
-    | Num | State                              | Min    | Max   | Unit  |
-    |-----|------------------------------------|--------|-------|-------|
-    | 0   | $x$                                | -100.0 | 100.0 | m     |
-    | 1   | $\dot x$                           | -20.0  | 20.0  | m/s   |
-    | 2   | $\varphi$, wrapped to $(-\pi,\pi]$ | $-\pi$ | $\pi$ | rad   |
-    | 3   | $\dot\varphi$                      | -20.0  | 20.0  | rad/s |
-
     ## Rewards
     $r = -L(s, u)$ with the stage cost
 
@@ -136,45 +108,8 @@ class CartPoleSwingUpEnv(ControlTask):
 
     of the state before the step. The best reward of a step is 0.
 
-    ## Starting State
-    | `start`             | $x$            | $\dot x$       | $\varphi$             | $\dot\varphi$  |
-    |---------------------|----------------|----------------|-----------------------|----------------|
-    | `"broad"` (default) | $U(-1, 1)$     | $U(-0.5, 0.5)$ | $U(-\pi, \pi)$        | $U(-1, 1)$     |
-    | `"hanging"`         | $U(-0.1, 0.1)$ | $U(-0.1, 0.1)$ | $\pi + U(-0.2, 0.2)$  | $U(-0.1, 0.1)$ |
-
-    `reset(options=...)` takes one of `{"start": name}`, `{"state": s}` (start at $s$) and `{"low": l, "high": h}`
-    (uniform between two states or scalars; the bounds of $\varphi$ may reach to $\pm 2\pi$, the draw is wrapped).
-
-    ## Episode End
-    1. Termination: never.
-    2. Truncation: after 100 steps (5 s); `gym.make(..., max_episode_steps=...)` sets another length.
-
+    ## Success
     The episode is a success if $|\varphi| < 0.3$ at its end.
-
-    ## Arguments
-    `gym.make("mpcoffline/CartPoleSwingUp-v0", mu=0.4, measurement_noise=[0.01, 0.05, 0.01, 0.05])`. Lists instead of
-    arrays keep `env.spec` storable as JSON.
-
-    | Argument            | Type             | Default   | Meaning and range                                    |
-    |---------------------|------------------|-----------|------------------------------------------------------|
-    | `m_c`               | float            | 0.2       | mass of the cart, 0.01 to 100 kg                     |
-    | `mu`                | float            | 0.5       | friction of the cart, 0 to $40(m_c + m_p/4)$ N s/m   |
-    | `m_p`               | float            | 0.2       | mass of the pole, 0.01 to 100 kg                     |
-    | `l`                 | float            | 0.5       | half the length of the pole, 0.05 to 20 m            |
-    | `g`                 | float            | 9.8       | gravity, 0 to 30 m/s²                                |
-    | `start`             | str, (low, high) | `"broad"` | starting states: a name, or bounds                   |
-    | `process_noise`     | float, list      | 0.0       | std of noise $w$, one or one a state: $s_+ + w$      |
-    | `measurement_noise` | float, list      | 0.0       | std of noise $v$, one or one a state: $y = h(s + v)$ |
-    | `render_mode`       | str              | None      | `"human"` (a window), `"rgb_array"` (pictures)       |
-
-    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
-
-    ## Info
-    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
-    just taken, 0 at reset) and `info["is_success"]` (bool).
-
-    ## Version History
-    * v0: first release.
 
     ## References
     Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.

@@ -71,7 +71,10 @@ PLANT = Plant(
         Input("F_x", "F_x", "N", -MAX_FORCE, MAX_FORCE, quantity="force"),
         Input("F_y", "F_y", "N", -MAX_FORCE, MAX_FORCE, quantity="force"),
     ),
-    parameters=(Parameter("A", A0, spread=0.0), Parameter("B", B0, spread=0.0)),
+    parameters=(
+        Parameter("A", A0, spread=0.0, meaning=r"the plant's matrix, instead; $b \ge 1$ (see State Space)"),
+        Parameter("B", B0, spread=0.0, meaning=r"the plant's input matrix, instead; $b \ge 1$"),
+    ),
     discrete=True,
     dynamics=dynamics,
     cost=cost,
@@ -100,25 +103,6 @@ class LinearTrackingEnv(ControlTask):
 
     sampled every $dt = 0.1$ s. For any $\alpha > 0$ the plant is unstable.
 
-    ## Action Space
-    `Box(-10.0, 10.0, (2,), float32)`. An action beyond the bounds is clipped to them.
-
-    | Num | Action      | Min   | Max  | Unit |
-    |-----|-------------|-------|------|------|
-    | 0   | force $F_x$ | -10.0 | 10.0 | N    |
-    | 1   | force $F_y$ | -10.0 | 10.0 | N    |
-
-    ## Observation Space
-    `Box(-1e4, 1e4, (4,), float32)`. The bounds hold for any state that 100 steps can reach from `state_space`; in
-    longer episodes the state saturates at them.
-
-    | Num | Observation | Min  | Max | Unit |
-    |-----|-------------|------|-----|------|
-    | 0   | $x$         | -1e4 | 1e4 | m    |
-    | 1   | $y$         | -1e4 | 1e4 | m    |
-    | 2   | $\dot x$    | -1e4 | 1e4 | m/s  |
-    | 3   | $\dot y$    | -1e4 | 1e4 | m/s  |
-
     ## State Space
     The state $s = [x, y, \dot x, \dot y]$ in `info["state"]` is the observation in float64. `state_space`, a
     `Box(float64)`, holds the states that `reset` accepts: $|s_i| \le b$ with the largest $b$ from which no admissible
@@ -131,37 +115,8 @@ class LinearTrackingEnv(ControlTask):
 
     of the state before the step. The best reward of a step is 0.
 
-    ## Starting State
-    $s_0 \sim U[-1, 1]^4$, which `start` calls `"broad"`. `reset(options=...)` takes one of `{"start": "broad"}`,
-    `{"state": s}` (start at $s$) and `{"low": l, "high": h}` (uniform between two states or scalars).
-
-    ## Episode End
-    1. Termination: never.
-    2. Truncation: after 100 steps (10 s); `gym.make(..., max_episode_steps=...)` sets another length.
-
+    ## Success
     The episode is a success if $|(x, y)| < 0.05$ at its end.
-
-    ## Arguments
-    `gym.make("mpcoffline/LinearTracking-v0", alpha=0.5)`. Lists instead of arrays keep `env.spec` storable as JSON.
-
-    | Argument            | Type             | Default    | Meaning and range                                        |
-    |---------------------|------------------|------------|----------------------------------------------------------|
-    | `alpha`             | float            | 1.0        | size of the model error, 0 to 4                          |
-    | `A`                 | 4 x 4 list       | by `alpha` | the plant's matrix, instead; $b \ge 1$ (see State Space) |
-    | `B`                 | 4 x 2 list       | by `alpha` | the plant's input matrix, instead; $b \ge 1$             |
-    | `start`             | str, (low, high) | `"broad"`  | starting states: a name, or bounds                       |
-    | `process_noise`     | float, list      | 0.0        | std of noise $w$, one or one a state: $s_+ + w$          |
-    | `measurement_noise` | float, list      | 0.0        | std of noise $v$, one or one a state: $y = s + v$        |
-    | `render_mode`       | str              | None       | `"human"` (a window), `"rgb_array"` (pictures)           |
-
-    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
-
-    ## Info
-    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
-    just taken, 0 at reset) and `info["is_success"]` (bool).
-
-    ## Version History
-    * v0: first release.
 
     ## References
     Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.

@@ -39,9 +39,9 @@ PLANT = Plant(
     ),
     inputs=(Input("u", "u", "N m", -MAX_TORQUE, MAX_TORQUE, quantity="torque"),),
     parameters=(
-        Parameter("m", 1.0, 0.01, 100.0, "kg", spread=0.5),
-        Parameter("l", 1.0, 0.05, 20.0, "m", spread=0.5),
-        Parameter("g", 9.8, 0.0, 30.0, "m/s^2"),
+        Parameter("m", 1.0, 0.01, 100.0, "kg", spread=0.5, meaning="mass"),
+        Parameter("l", 1.0, 0.05, 20.0, "m", spread=0.5, meaning="length"),
+        Parameter("g", 9.8, 0.0, 30.0, "m/s^2", meaning="gravity"),
     ),
     dynamics=dynamics,
     cost=cost,
@@ -71,32 +71,6 @@ class PendulumSwingUpEnv(ControlTask):
     with $\varphi = 0$ upright and positive clockwise in the picture; integrated with one Runge-Kutta (RK4) step of
     $dt = 0.05$ s, the torque held. There is no friction.
 
-    ## Action Space
-    `Box(-2.0, 2.0, (1,), float32)`. An action beyond the bounds is clipped to them.
-
-    | Num | Action     | Min  | Max | Unit |
-    |-----|------------|------|-----|------|
-    | 0   | torque $u$ | -2.0 | 2.0 | N m  |
-
-    ## Observation Space
-    `Box([-1, -1, -200], [1, 1, 200], (3,), float32)`. The bound of the speed holds for any state that 100 steps of the
-    default plant can reach from `state_space`; in longer episodes the speed saturates at it.
-
-    | Num | Observation    | Min    | Max   | Unit  |
-    |-----|----------------|--------|-------|-------|
-    | 0   | $\cos\varphi$  | -1.0   | 1.0   |       |
-    | 1   | $\sin\varphi$  | -1.0   | 1.0   |       |
-    | 2   | $\dot\varphi$  | -200.0 | 200.0 | rad/s |
-
-    ## State Space
-    The state $s = [\varphi, \dot\varphi]$ is in `info["state"]`; `state_space`, a `Box(float64)`, holds the states that
-    `reset` accepts.
-
-    | Num | State                              | Min    | Max   | Unit  |
-    |-----|------------------------------------|--------|-------|-------|
-    | 0   | $\varphi$, wrapped to $(-\pi,\pi]$ | $-\pi$ | $\pi$ | rad   |
-    | 1   | $\dot\varphi$                      | -90.0  | 90.0  | rad/s |
-
     ## Rewards
     $r = -L(s, u)$ with the stage cost
 
@@ -104,43 +78,8 @@ class PendulumSwingUpEnv(ControlTask):
 
     of the state before the step. The best reward of a step is 0.
 
-    ## Starting State
-    | `start`             | $\varphi$               | $\dot\varphi$   |
-    |---------------------|-------------------------|-----------------|
-    | `"broad"` (default) | $U(-\pi, \pi)$          | $U(-1, 1)$      |
-    | `"hanging"`         | $\pi + U(-0.2, 0.2)$    | $U(-0.1, 0.1)$  |
-
-    `reset(options=...)` takes one of `{"start": name}`, `{"state": s}` (start at $s$) and `{"low": l, "high": h}`
-    (uniform between two states or scalars; the bounds of $\varphi$ may reach to $\pm 2\pi$, the draw is wrapped).
-
-    ## Episode End
-    1. Termination: never.
-    2. Truncation: after 100 steps (5 s); `gym.make(..., max_episode_steps=...)` sets another length.
-
+    ## Success
     The episode is a success if $|\varphi| < 0.3$ at its end.
-
-    ## Arguments
-    `gym.make("mpcoffline/PendulumSwingUp-v0", m=1.1, process_noise=[0.0, 0.05])`. Lists instead of arrays keep
-    `env.spec` storable as JSON.
-
-    | Argument            | Type             | Default   | Meaning and range                                    |
-    |---------------------|------------------|-----------|------------------------------------------------------|
-    | `m`                 | float            | 1.0       | mass, 0.01 to 100 kg                                 |
-    | `l`                 | float            | 1.0       | length, 0.05 to 20 m                                 |
-    | `g`                 | float            | 9.8       | gravity, 0 to 30 m/s²                                |
-    | `start`             | str, (low, high) | `"broad"` | starting states: a name, or bounds                   |
-    | `process_noise`     | float, list      | 0.0       | std of noise $w$, one or one a state: $s_+ + w$      |
-    | `measurement_noise` | float, list      | 0.0       | std of noise $v$, one or one a state: $y = h(s + v)$ |
-    | `render_mode`       | str              | None      | `"human"` (a window), `"rgb_array"` (pictures)       |
-
-    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
-
-    ## Info
-    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
-    just taken, 0 at reset) and `info["is_success"]` (bool).
-
-    ## Version History
-    * v0: first release.
 
     ## References
     Sawant, Anand, Reinhardt, Gros, "Learning-based MPC from Big Data Using Reinforcement Learning", arXiv:2301.01667.

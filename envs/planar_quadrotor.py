@@ -54,11 +54,11 @@ PLANT = Plant(
         Input("torque", r"\tau", "N m", -MAX_TORQUE, MAX_TORQUE, quantity="torque"),
     ),
     parameters=(
-        Parameter("m", MASS, 0.1, 10.0, "kg", spread=0.15),
-        Parameter("J", 0.02, 0.01, 1.0, "kg m2", spread=0.006),
-        Parameter("mu", 0.5, 0.0, 2.0, "N s/m", spread=0.2),
-        Parameter("c", 0.04, 0.0, 0.2, "N m s", spread=0.015),
-        Parameter("g", GRAVITY, 0.0, 30.0, "m/s2"),
+        Parameter("m", MASS, 0.1, 10.0, "kg", spread=0.15, meaning="mass"),
+        Parameter("J", 0.02, 0.01, 1.0, "kg m2", spread=0.006, meaning="moment of inertia"),
+        Parameter("mu", 0.5, 0.0, 2.0, "N s/m", spread=0.2, meaning="drag on motion"),
+        Parameter("c", 0.04, 0.0, 0.2, "N m s", spread=0.015, meaning="drag on rotation"),
+        Parameter("g", GRAVITY, 0.0, 30.0, "m/s2", meaning="gravity"),
     ),
     dynamics=dynamics,
     cost=cost,
@@ -87,34 +87,6 @@ class PlanarQuadrotorEnv(ControlTask):
 
     integrated with one Runge-Kutta (RK4) step of $dt = 0.1$ s, the input held.
 
-    ## Action Space
-    `Box([0.0, -0.2], [10.0, 0.2], (2,), float32)`. An action beyond the bounds is clipped to them. $F = 4.9$ N hovers.
-
-    | Num | Action        | Min  | Max  | Unit |
-    |-----|---------------|------|------|------|
-    | 0   | thrust $F$    | 0.0  | 10.0 | N    |
-    | 1   | torque $\tau$ | -0.2 | 0.2  | N m  |
-
-    ## Observation Space
-    `Box([-3000, -3000, -1, -1, -500, -500, -500], [3000, 3000, 1, 1, 500, 500, 500], (7,), float32)`. The bounds hold
-    for any state that 100 steps of the default plant can reach from `state_space`; in longer episodes positions and
-    speeds saturate at them.
-
-    | Num | Observation    | Min     | Max    | Unit  |
-    |-----|----------------|---------|--------|-------|
-    | 0   | $x$            | -3000.0 | 3000.0 | m     |
-    | 1   | $z$            | -3000.0 | 3000.0 | m     |
-    | 2   | $\cos\varphi$  | -1.0    | 1.0    |       |
-    | 3   | $\sin\varphi$  | -1.0    | 1.0    |       |
-    | 4   | $\dot x$       | -500.0  | 500.0  | m/s   |
-    | 5   | $\dot z$       | -500.0  | 500.0  | m/s   |
-    | 6   | $\dot\varphi$  | -500.0  | 500.0  | rad/s |
-
-    ## State Space
-    The state $s = [x, z, \varphi, \dot x, \dot z, \dot\varphi]$ is in `info["state"]`; `state_space`, a `Box(float64)`,
-    holds the states that `reset` accepts: $|x|, |z| \le 300$ m, speeds up to 100 m/s and 100 rad/s, $\varphi$ wrapped
-    to $(-\pi, \pi]$.
-
     ## Rewards
     $r = -L$ with the stage cost
 
@@ -122,40 +94,8 @@ class PlanarQuadrotorEnv(ControlTask):
 
     of the state before the step. The best reward of a step is 0.
 
-    ## Starting State
-    Uniform, which `start` calls `"broad"`: $x, z, \varphi$ and $\dot\varphi$ in $[-1, 1]$, $\dot x, \dot z$ in
-    $[-0.5, 0.5]$. `reset(options=...)` takes one of `{"start": "broad"}`, `{"state": s}` (start at $s$) and
-    `{"low": l, "high": h}` (uniform between two states or scalars; the draw of $\varphi$ is wrapped).
-
-    ## Episode End
-    1. Termination: never.
-    2. Truncation: after 100 steps (10 s); `gym.make(..., max_episode_steps=...)` sets another length.
-
+    ## Success
     The episode is a success if $|(x, z)| < 0.1$ m at its end.
-
-    ## Arguments
-    `gym.make("mpcoffline/PlanarQuadrotor-v0", m=0.6)`. Lists instead of arrays keep `env.spec` storable as JSON.
-
-    | Argument            | Type             | Default   | Meaning and range                                    |
-    |---------------------|------------------|-----------|------------------------------------------------------|
-    | `m`                 | float            | 0.5       | mass, 0.1 to 10 kg                                   |
-    | `J`                 | float            | 0.02      | moment of inertia, 0.01 to 1 kg m²                   |
-    | `mu`                | float            | 0.5       | drag on motion, 0 to 2 N s/m                         |
-    | `c`                 | float            | 0.04      | drag on rotation, 0 to 0.2 N m s                     |
-    | `g`                 | float            | 9.8       | gravity, 0 to 30 m/s²                                |
-    | `start`             | str, (low, high) | `"broad"` | starting states: a name, or bounds                   |
-    | `process_noise`     | float, list      | 0.0       | std of noise $w$, one or one a state: $s_+ + w$      |
-    | `measurement_noise` | float, list      | 0.0       | std of noise $v$, one or one a state: $y = h(s + v)$ |
-    | `render_mode`       | str              | None      | `"human"` (a window), `"rgb_array"` (pictures)       |
-
-    Noise is Gaussian and off by default; `info` stays true under measurement noise. `ControlTask` states it precisely.
-
-    ## Info
-    `reset` and `step` return `info["state"]` (float64, the true $s$ reached), `info["cost"]` (float, $L$ of the step
-    just taken, 0 at reset) and `info["is_success"]` (bool).
-
-    ## Version History
-    * v0: first release.
 
     ## References
     Not a task of arXiv:2301.01667: the plant is the usual planar model of a multirotor, its numbers are ours.

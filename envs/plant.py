@@ -42,6 +42,7 @@ class Parameter:
         unit: Physical unit.
         spread: Half-width of its error in MPC_1 at alpha = 1; learning may move it from 1/100 to 100 times the plant's
             value. Zero: MPC_1 has ``value``, and learning may move it anywhere. None: known, and no parameter of MPC_1.
+        meaning: What it is, for the documentation; with its range where ``high`` is a function.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Parameter:
     high: float | Callable[[Values], float] = math.inf
     unit: str = ""
     spread: float | None = None
+    meaning: str = ""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import gymnasium as gym
 
 from .base import ControlTask
 from .episode import EPISODE_STEPS
+from .page import page
 from .plant import Plant
 from .vector import ControlTaskVectorEnv
 
@@ -56,6 +57,7 @@ def register(task: type[ControlTask]) -> type[ControlTaskVectorEnv]:
         raise ValueError(
             f"plant {plant.name!r}, {plant.id!r}: expected a name and an id that are free, got taken ones."
         )
+    task.__doc__ = page(plant, task.__doc__ or "")
     twin_name = f"{task.__name__.removesuffix('Env')}VectorEnv"
     doc = f"Many copies of :class:`{task.__name__}` stepped as arrays; see :class:`ControlTaskVectorEnv`."
     members = {"task_class": task, "__module__": task.__module__, "__doc__": doc}

@@ -22,6 +22,8 @@ from mpcoffline.solvers import SOLVERS, Plan, Solver, changed_options, check_sol
 from mpcoffline.solvers.fallback import Fallback, SolverStats
 from mpcoffline.solvers.options import OF_THE_MACHINE
 
+from .course import Course, course_from
+
 logger = logging.getLogger(__name__)
 
 
@@ -37,6 +39,10 @@ class MPCPolicy(BasePolicy):
     next input of the previous one (zero, within bounds, if there is none either). ``solver_stats`` counts each of these
     answers, and the first of each kind is logged.
 
+    Where the MPC's state holds past inputs (dead time, prices on changes), observations stay what they are: the inputs
+    that were applied, clipped and with noise, travel in ``state`` beside the plan. Of those before an episode nothing
+    is known; ``mpc.usual_input`` stands for them: the stage cost's ``u_ref``, else zero, within the bounds.
+
     The policy is also a plain function, ``policy(observations)``: actions alone, by cold solves.
 
     With ``deterministic=False`` it explores, so that an MPC can collect data::
@@ -47,7 +53,7 @@ class MPCPolicy(BasePolicy):
     travels in ``state`` is that of u_0*, without noise.
 
     Args:
-        mpc: The MPC; its state is the environment's observation.
+        mpc: The MPC; its observation is the environment's.
         solver: Name of the solver, see :func:`mpcoffline.make_solver`; or a solver of this very MPC.
             A policy's file names solver and options, so that to save one, an own class must be registered.
         observation_space: The environment's; unbounded by default.
@@ -65,8 +71,8 @@ class MPCPolicy(BasePolicy):
         solver_stats: Counts since construction, of solves and of how failures were answered.
 
     Raises:
-        InvalidArgumentError: For spaces of other sizes than the MPC's states and inputs, a negative noise or seed, a
-            ``rescue_time`` that is not positive, or an option that the solver has not, or a solver of another MPC.
+        InvalidArgumentError: For spaces of other sizes than the MPC's observations and inputs, a negative noise or
+            seed, a ``rescue_time`` that is not positive, an option that the solver has not, or a solver of another MPC.
         UnknownIdError: For an unknown solver or rescue.
     """
 
@@ -84,13 +90,13 @@ class MPCPolicy(BasePolicy):
         **solver_options: Any,
     ) -> None:
         if observation_space is None:
-            observation_space = spaces.Box(-np.inf, np.inf, (mpc.nx,), np.float32)
+            observation_space = spaces.Box(-np.inf, np.inf, (mpc.ny,), np.float32)
         if action_space is None:
             with np.errstate(over="ignore"):  # a bound beyond float32 is none
                 low, high = (np.asarray(bound, dtype=np.float32) for bound in (mpc.action_low, mpc.action_high))
             action_space = spaces.Box(low, high, dtype=np.float32)
         for name, space, size in (
-            ("observation_space", observation_space, mpc.nx),
+            ("observation_space", observation_space, mpc.ny),
             ("action_space", action_space, mpc.nu),
         ):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
@@ -184,18 +190,18 @@ class MPCPolicy(BasePolicy):
         state: tuple[NDArray[Any], ...] | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[Any], Plan]:
+    ) -> tuple[NDArray[Any], Plan | Course]:
         """The optimal first inputs, and the warm start for the next call.
 
         Args:
-            observation: ``(nx,)``, or ``(B, nx)`` for B environments; dictionaries are refused.
+            observation: ``(ny,)``, or ``(B, ny)`` for B environments; dictionaries are refused.
             state: What the previous call returned; None starts cold.
-            episode_start: ``(B,)`` booleans; environments that have just been reset start cold.
+            episode_start: ``(B,)`` booleans; environments that have just been reset start cold, without past inputs.
             deterministic: Whether to act without exploration noise.
 
         Returns:
             Actions ``(nu,)`` or ``(B, nu)`` within the bounds and in the dtype of the action space, and the state: the
-            plan shifted by one step.
+            plan shifted by one step, with the past inputs where the MPC asks for them.
 
         Raises:
             InvalidArgumentError: For an observation of the wrong shape or with NaN, a state of another batch size, or
@@ -205,17 +211,22 @@ class MPCPolicy(BasePolicy):
         observations = np.atleast_2d(given)
         if self._vec_normalize is not None:
             observations = self._unnormalized(observations, self._vec_normalize)
-        warm_start = self._warm_start(state, episode_start, len(observations))
+        warm_start, memory = course_from(self.mpc, state, episode_start, len(observations))
+        if memory is not None:
+            observations = self.mpc.state(observations, memory)
         solution = self.solver.solve(observations, warm_start=warm_start)
         inputs, plan = self._fallback.answer(self.solver, observations, warm_start, solution)
         if not deterministic:
             inputs = self._explored(inputs)
         space = self._action_box
         actions = np.clip(inputs.astype(space.dtype), space.low, space.high)
-        return (actions[0] if given.ndim == 1 else actions), plan
+        answer = actions[0] if given.ndim == 1 else actions
+        if memory is None:
+            return answer, plan
+        return answer, Course(*plan, self.mpc.layout.remembered(memory, actions.astype(np.float64)))
 
     def forward(self, observation: ArrayLike | torch.Tensor, deterministic: bool = True) -> NDArray[Any] | torch.Tensor:
-        """Actions ``(B, nu)`` of observations ``(B, nx)``, or of one, by cold solves: what ``policy(y)`` returns.
+        """Actions ``(B, nu)`` of observations ``(B, ny)``, or of one, by cold solves: what ``policy(y)`` returns.
 
         A tensor gives a tensor, without gradients; anything else an array.
         """
@@ -235,7 +246,8 @@ class MPCPolicy(BasePolicy):
         return self.action_space
 
     def _checked_observation(self, observation: ArrayLike | dict[str, NDArray[Any]]) -> NDArray[np.float64]:
-        expected = f"shape ({self.mpc.nx},) or (B, {self.mpc.nx})"
+        ny = self.mpc.ny
+        expected = f"shape ({ny},) or (B, {ny})"
         try:
             array = np.asarray(cast(ArrayLike, observation), dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -245,7 +257,7 @@ class MPCPolicy(BasePolicy):
                 actual=f"{type(observation).__name__}: {error}",
                 hint="Gymnasium's reset() returns observation and info, a VecEnv's the observations alone.",
             ) from error
-        if array.ndim not in (1, 2) or array.shape[-1] != self.mpc.nx or not array.size:
+        if array.ndim not in (1, 2) or array.shape[-1] != ny or not array.size:
             raise InvalidArgumentError(
                 "observation",
                 expected=expected,
@@ -278,32 +290,6 @@ class MPCPolicy(BasePolicy):
                 actual=f"False in {self.action_space}",
             )
         return inputs + self.exploration_noise * width * self._noise_generator.standard_normal(inputs.shape)
-
-    def _warm_start(
-        self, state: tuple[NDArray[Any], ...] | None, episode_start: ArrayLike | None, n_problems: int
-    ) -> Plan:
-        """The plan to start from, without the rows whose episode has just begun."""
-        if state is None:
-            return Plan.none(n_problems, self.mpc)
-        if len(state) != 2:
-            raise InvalidArgumentError(
-                "state", expected="what predict returned: states and inputs", actual=f"{len(state)} arrays"
-            )
-        plan = Plan(*state)
-        if len(plan.u) != n_problems:
-            raise InvalidArgumentError(
-                "state", expected=f"the state of {n_problems} environments", actual=f"that of {len(plan.u)}"
-            )
-        if episode_start is None:
-            return plan
-        started = np.asarray(episode_start, dtype=bool)
-        if started.shape not in ((), (n_problems,)):
-            raise InvalidArgumentError(
-                "episode_start", expected=f"shape ({n_problems},)", actual=f"shape {started.shape}"
-            )
-        if not started.any():  # as at nearly every step
-            return plan
-        return plan.select(~np.broadcast_to(started, (n_problems,)))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed.

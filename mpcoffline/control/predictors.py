@@ -38,7 +38,7 @@ class D3rlpyPredictor:
         self.gamma, self.action_size = policy.mpc.discount, policy.mpc.nu
 
     def predict(self, x: ArrayLike) -> NDArray[Any]:
-        """Actions ``(B, nu)`` of observations ``(B, nx)``, by cold solves.
+        """Actions ``(B, nu)`` of observations ``(B, ny)``, by cold solves.
 
         Raises:
             InvalidArgumentError: For observations of the wrong shape or with NaN.
@@ -57,10 +57,10 @@ class D3rlpyPredictor:
         """The return that the MPC expects, -Q_theta(s, a), ``(B,)``: d3rlpy maximises reward, an MPC minimises cost.
 
         Args:
-            x: Observations, ``(B, nx)``.
+            x: Observations, ``(B, ny)``.
             action: Actions, ``(B, nu)``.
 
         Raises:
             InvalidArgumentError: For a wrong shape, NaN, or actions out of bounds.
         """
-        return -self.policy.solver.q_value(x, action)
+        return -self.policy.solver.q_value(self.policy.mpc.state(x), action)

@@ -10,12 +10,14 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.smoothing import SmoothedIdentification, identify_smoothed
+from mpcoffline.estimation import Identification, identify
+from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.closed_loop import Simulation, initial_states, simulate
+from mpcoffline.simulation.closed_loop import Simulation, initial_rows, signals_along, simulate
 from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
 
@@ -85,19 +87,23 @@ def diagnose(
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
-    table = TransitionTable.of(dataset)
-    found = identify_smoothed(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.with_theta(found.identification.theta)
-    ensemble = Ensemble(nominal, clean, found.identification, seed=seed)
-    cost = LoggedCost(clean, seed)
     policies = MPCPolicy(nominal), MPCPolicy(learned)
+    if nominal.layout.delay != learned.layout.delay:  # of the dead time that the learner has found
+        nominal = nominal.with_delay(learned.layout.delay)
+    table = with_memory(TransitionTable.of(dataset), learned.layout)
+    found = identify(nominal, table, seed=seed)
+    clean, identified = found.table, nominal.replace(model=found.model)
+    ensemble = Ensemble(identified, clean, found, seed=seed)
+    seen = None if learned.layout.has_previous else learned.ny
+    cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
-    starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
-    first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
+    rows = initial_rows(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
+    starts, signals = clean.take(rows).values().observations, signals_along(clean, rows, n_steps, learned.layout)
+    first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps, signals) for policy in policies)
     comparison = Comparison.of(first, second, cost.r2)
     lag = lag_check(identified, clean)
     verdict, reasons = decide(comparison, lag, found.noise, len(table))
-    reference = learned.reference
+    reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
     report = Report(
         verdict=verdict,
         reasons=reasons,
@@ -108,7 +114,7 @@ def diagnose(
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
         weights=weight_checks(nominal, learned),
-        at_bounds=bound_names(learned, nominal),
+        at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
         lag=lag,
         noise=found.noise,
@@ -117,8 +123,8 @@ def diagnose(
         n_rows=len(table),
         n_episodes=table.n_episodes,
         traces=Traces(
-            first.states,
-            second.states,
+            first.states[..., : learned.layout.n_states],
+            second.states[..., : learned.layout.n_states],
             np.stack(returns_of(learner.value_function, clean, learned.discount)),
             reference,
         ),
@@ -126,9 +132,9 @@ def diagnose(
     return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
 
 
-def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: SmoothedIdentification) -> PredictionCheck:
+def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:
     before, best, after = (one_step_error(mpc, found.table) for mpc in (nominal, identified, learned))
-    return PredictionCheck(before, best, after, found.identification.undetermined)
+    return PredictionCheck(before, best, after, found.undetermined)
 
 
 def _theorem(
@@ -144,7 +150,7 @@ def _theorem(
     return TheoremCheck(
         value_growth(value, table, states, bool(simulation.lost[0].any())),
         outside_support(table, states),
-        () if reference is None else closed_loop_eigenvalues(learned, policy.solver, table, reference),
+        () if reference is None else closed_loop_eigenvalues(learned, policy.solver, table, settled(learned, table)),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 import scipy.spatial
@@ -11,14 +10,14 @@ import scipy.stats
 import torch
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import rows_before
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import increments_scale
 from mpcoffline.learning import FitResult, ValueFunction
-from mpcoffline.learning.bellman.equation import BellmanProblem, variance_of
+from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
-from mpcoffline.mpc.parameters import Group
+from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale, spread_of
 
 _ROWS = 10_000
 _TREE_ROWS = 5_000
@@ -26,7 +25,7 @@ _MOST_EPISODES = 200
 _TAIL = 0.05  # share of a discounted return that may lie beyond the episode's end
 _REGIONS = 4
 _NEAR = 0.25  # spreads of the data: a state this close to the reference has reached it
-_LAGS = 2
+_LAGS = 6  # steps before the present that are looked at, fewer where episodes are short
 _LAG_FEATURES = 100
 _MUCH_LAG = 0.05  # of the effect of the present input
 
@@ -54,6 +53,8 @@ class ValueCheck:
 @dataclass(frozen=True)
 class RegionError:
     """The regression error of (FIT) in one part of the data, in units of the cost's variance.
+
+    A constant that the error has in all data does not count: it is a constant of the cost, which changes no input.
 
     Attributes:
         name: The part, by quantiles of V.
@@ -133,7 +134,7 @@ def fit_errors(
     """
     sample = table.sample(_ROWS, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
-    unit = variance_of(sample.costs)
+    unit = cost_spread(sample.costs)
     before, after = (
         _residuals(BellmanProblem(mpc, value, unit), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)
@@ -145,6 +146,7 @@ def fit_errors(
             reached = model.predicted(columns, torch.from_numpy(learned.theta))
             shaping = potential(columns.observations) - model.discounted(columns) * potential(reached)
         after = after - shaping.double().numpy()
+    before, after = before - before.mean(), after - after.mean()
     values = value.predict(sample.observations)
     edges = np.quantile(values, np.linspace(0.0, 1.0, _REGIONS + 1))
     parts = {"all data": np.ones(len(values), dtype=bool)}
@@ -152,7 +154,7 @@ def fit_errors(
         name = ("V lowest quarter", "V second quarter", "V third quarter", "V highest quarter")[k]
         parts[name] = (values >= edges[k]) & (values <= edges[k + 1])
     return tuple(
-        RegionError(name, float(np.mean(before[part] ** 2) / unit), float(np.mean(after[part] ** 2) / unit))
+        RegionError(name, *(float(np.mean((missed[part] / unit) ** 2)) for missed in (before, after)))
         for name, part in parts.items()
     )
 
@@ -170,8 +172,7 @@ def outside_support(table: TransitionTable, states: Array) -> float:
     By the distance to the nearest logged state, coordinates in spreads of the data.
     """
     sample = table.sample(2 * _TREE_ROWS, 1)
-    spread = sample.observations.std(axis=0)
-    scale = np.where(spread > 0.0, spread, 1.0).astype(np.float64)
+    scale = spread_of(sample.observations)
     order = np.random.default_rng(0).permutation(len(sample))
     half = max(1, len(sample) // 2)
     known, others = (sample.observations[order[part]] / scale for part in (slice(None, half), slice(half, None)))
@@ -193,11 +194,12 @@ def one_step_error(mpc: MPC, table: TransitionTable) -> float:
     sample = table.sample(_ROWS, 3)
     s, reached = (v.astype(np.float64) for v in (sample.observations, sample.next_observations))
     missed = (mpc.model(s, sample.actions) - reached) / increments_scale(s, reached, table.centring.centre[: table.ny])
+    missed = missed[:, : mpc.layout.n_states]
     return float(np.sqrt(np.mean(np.nan_to_num(missed, nan=1e3, posinf=1e3, neginf=-1e3) ** 2)))
 
 
 def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
-    """Whether the identified model's one-step errors depend on the inputs of the two steps before.
+    """Whether the identified model's one-step errors depend on inputs of steps before, which its state does not hold.
 
     What a regression on state and present input (products and random features) explains is taken out first, so that a
     wrong structure is not taken for a lag; what past inputs explain beyond is tested by an F test.
@@ -207,21 +209,23 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
         table: The transitions, smoothed where they were noisy: past inputs tell of the true state, and with it of the
             noise in the logged one.
     """
-    rows = np.arange(_LAGS, len(table))
-    same = (table.episode_ids[rows] == table.episode_ids[rows - _LAGS]) & (table.terminations[rows - 1] == 0.0)
-    rows = rows[same]
+    layout, lags = identified.layout, min(_LAGS, max(1, int(np.median(table.episodes.lengths)) // 4))
+    rows = np.flatnonzero(rows_before(table) >= layout.steps + lags)
     if len(rows) > _ROWS:
         rows = np.sort(np.random.default_rng(0).permutation(rows)[:_ROWS])
     if len(rows) < 50:
         return LagCheck(0.0, 1.0)
-    s, a, _, reached, _ = table.take(rows).values()
-    scale = increments_scale(s, reached, table.centring.centre[: table.ny])
-    predicted = identified.model(s, a)
-    effect = (predicted - identified.model(s, np.broadcast_to(a.mean(axis=0), a.shape))) / scale
-    errors = (reached - predicted) / scale
+    z, u, _, reached, _ = table.take(rows).values()
+    n, (x, acting) = layout.n_states, layout.split(z, u)
+    scale, plant = increments_scale(x, reached[:, :n], table.centring.centre[:n]), identified.plant_function
+    predicted, without = (
+        np.asarray(plant(x.T, v.T, identified.theta).full().T)
+        for v in (acting, np.hstack([np.broadcast_to(u.mean(axis=0), u.shape), acting[:, u.shape[1] :]]))
+    )
+    effect, errors = (predicted - without) / scale, (reached[:, :n] - predicted) / scale
     good = np.isfinite(errors).all(axis=1) & np.isfinite(effect).all(axis=1)
-    past = np.hstack([table.take(rows - k).actions.astype(np.float64) for k in range(1, _LAGS + 1)])
-    present = np.hstack([s, a])
+    past = np.hstack([table.take(rows - layout.steps - k).actions.astype(np.float64) for k in range(1, lags + 1)])
+    present = np.hstack([z, u])
     n_random = min(_LAG_FEATURES, len(rows) // 10)
     features = RandomFeatures(present, n_random, np.random.default_rng(0))(present)[good]
     errors, past, effect = errors[good], past[good], effect[good]
@@ -240,13 +244,14 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
 
 def goal_share(table: TransitionTable, reference: Array) -> float:
     """Share of the logged states within a quarter of the data's spread of the reference, in every coordinate."""
-    spread = table.observations.std(axis=0)
-    scale = np.where(spread > 0.0, spread, 1.0)
-    return float(np.mean((np.abs(table.observations - reference) < _NEAR * scale).all(axis=1)))
+    states = table.observations[:, : len(reference)]
+    return float(np.mean((np.abs(states - reference) < _NEAR * spread_of(states)).all(axis=1)))
 
 
-def bound_names(mpc: MPC, nominal: MPC) -> tuple[str, ...]:
+def bound_names(mpc: MPC, nominal: MPC, table: TransitionTable) -> tuple[str, ...]:
     """Parameters on a bound that were not on it before; the zeros of a matrix factor's diagonal are no bounds."""
     before, after = (dict(zip(m.space.names, m.theta, strict=True)) for m in (nominal, mpc))
-    on_bounds = Coordinates(mpc, get_args(Group)).at_bounds(mpc.theta)
+    s, a, costs, reached, _ = table.sample(_ROWS, 4).values()
+    scaling = Scaling.of(s, a, costs, reached, table.centring.centre[: table.ny])
+    on_bounds = Coordinates(mpc, ("cost", "model"), scaling).at_bounds(mpc.theta)
     return tuple(name for name in on_bounds if before.get(name) != after[name])

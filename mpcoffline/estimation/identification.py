@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -20,18 +19,22 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
+from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
+from .plant import plant_rows
+from .uncertainty import Misfit, clusters, uncertainty
 
 logger = logging.getLogger(__name__)
 
 FULL_TURN = 2.0 * np.pi
+#: Spreads of the increments: what a prediction that is not finite counts, and from where on errors count by less.
+ABSURD = 1e3
 _NEAR_TURN = 0.5  # rad
+_MOST_TURNS = 10  # a step; beyond 1e16, every number is one of full turns
 _AT_BOUND = 1e-4  # in scaled coordinates
 _WEAKEST_PRIOR = 1e-10
-_NOT_FINITE = 1e3  # what a prediction that is not finite counts, in spreads of the increments
 _FEW_ROWS = 1_000  # for the way to the minimum
-_LARGEST = 1e150  # whose square is a float64
 _PRIOR_ROUNDS = 3  # until sigma^2, which begins at 1, is that of the minimum
 _MAX_ENTRIES = 20_000_000  # of the Jacobian: 160 MB
 
@@ -61,7 +64,7 @@ class IdentificationConfig:
 
 
 @dataclass(frozen=True)
-class Identification:
+class OneStepIdentification:
     """An identified model, and how far it can be trusted.
 
     Errors are root mean squares of the one-step prediction error s+ - f(s,a), a coordinate divided by ``scale``, so
@@ -69,13 +72,16 @@ class Identification:
 
     Attributes:
         theta: All parameters of the MPC, those of the model identified, ``(size,)``.
-        deviation: One standard deviation of each, given data and prior; 0 where not identified, ``(size,)``.
+        deviation: One standard deviation of each, given data and prior, with the episodes' own scatter: errors that
+            last over many rows count as few; 0 where not identified, ``(size,)``.
         scale: Spread of the increments s+ - s, ``(nx,)``.
-        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``.
+        errors_before: Normalised error of each coordinate at theta_0, ``(nx,)``; a single one counts 1000 at most.
         errors_after: The same at theta.
         at_bound: Names of the parameters that ended at a bound.
-        undetermined: Parameters, or combinations of them, that the data do not determine; these stay near theta_0.
+        undetermined: Parameters, or combinations of them, that the data do not determine: moved to either side by as
+            much as the prior leaves open, they predict the data as well. These stay near theta_0.
         unwrapped: Coordinates that proved to be wrapped angles.
+        absurd: Rows that the model predicts by more than 1000 spreads wrong, or not at all, and rows looked at.
     """
 
     theta: Array
@@ -86,6 +92,7 @@ class Identification:
     at_bound: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
     unwrapped: tuple[int, ...] = ()
+    absurd: tuple[int, int] = (0, 0)
 
     @property
     def error_before(self) -> float:
@@ -96,6 +103,19 @@ class Identification:
     def error_after(self) -> float:
         """The same at theta."""
         return float(np.sqrt(np.mean(self.errors_after**2)))
+
+    def warn(self) -> None:
+        """Logs what the user should know."""
+        if self.undetermined:
+            text = "The data do not determine %s; kept near the given values."
+            logger.warning(text, ", nor ".join(self.undetermined))
+        if self.at_bound:
+            logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", self.at_bound)
+        if self.unwrapped:
+            logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(self.unwrapped))
+        if self.absurd[0]:
+            text = "The model's predictions of %d of %d rows are absurd or not finite: is it right there, are the data?"
+            logger.warning(text, *self.absurd)
 
 
 class Rows(NamedTuple):
@@ -121,14 +141,17 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
-    def __init__(self, mpc: MPC, rows: Rows, centre: Array | float = 0.0) -> None:
-        self.coordinates = c = Coordinates(mpc, ("model",))
+    def __init__(
+        self, mpc: MPC, rows: Rows, centre: Array | float = 0.0, coordinates: Coordinates | None = None
+    ) -> None:
+        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
+        c = coordinates or Coordinates(mpc, ("model",), Scaling(rows.x, rows.u, self.scale))
+        self.coordinates = c
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
         self.free = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
         self.names = [names[i] for i in self.free]
-        self.rows, self.scale = rows, increments_scale(rows.x, rows.reached, centre)
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
@@ -158,12 +181,19 @@ class OneStepProblem:
         return (predicted - self.rows.reached) / self.scale
 
     def linearised(self, z: Array) -> tuple[Array, Array]:
-        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall."""
+        """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall.
+
+        Errors e beyond c = 1000 count c (1 + log(e / c)): a few absurd ones do not decide what the model is.
+        """
         predicted, slopes = self.model.with_slopes(self.rows.x, self.rows.u, self.theta(z))
         errors = (predicted - self.rows.reached) / self.scale
         jacobian = slopes[:, :, self.free] * self.slopes(z) / self.scale[:, None]
         finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
-        return np.where(finite, errors, _NOT_FINITE), np.where(finite[:, :, None], jacobian, 0.0)
+        errors, jacobian = np.where(finite, errors, ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
+        beyond = np.maximum(np.abs(errors) / ABSURD, 1.0)
+        if (beyond > 1.0).any():
+            errors, jacobian = errors * (1.0 + np.log(beyond)) / beyond, jacobian / beyond[:, :, None]
+        return errors, jacobian
 
     def descend(self, start: Array, prior: float, max_iterations: int) -> _Descent:
         """Trust-region Gauss-Newton from one start, within the bounds (scipy's ``trf``)."""
@@ -193,18 +223,22 @@ class OneStepProblem:
                 gtol=1e-12,
             )
         except (ValueError, np.linalg.LinAlgError) as error:  # squares of the derivative overflow
-            raise InvalidDataError(
-                "identification",
-                expected="data on which the model's prediction has finite derivatives",
-                actual=f"states up to {np.abs(self.rows.x).max():g} ({error})",
-                hint="Are the data in the model's units?",
-            ) from error
+            raise self.unpredictable(str(error)) from error
         return _Descent(np.asarray(found.x), 2.0 * float(found.cost))
 
+    def unpredictable(self, reason: str) -> InvalidDataError:
+        """The error that says that the model makes nothing of the data."""
+        return InvalidDataError(
+            "identification",
+            expected="data that the model can predict",
+            actual=f"states up to {np.abs(self.rows.x).max():g} ({reason})",
+            hint="Are the data in the model's units?",
+        )
 
-def identify(
+
+def identify_one_step(
     mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
-) -> Identification:
+) -> OneStepIdentification:
     """Identifies the model by least squares of the one-step prediction error.
 
     ::
@@ -213,7 +247,7 @@ def identify(
 
     with scale the spread of the increments s+ - s of each coordinate, z the scaled coordinates of the model parameters
     and sigma^2 the mean square error that remains: the maximum a posteriori estimate, whose prior decides only what
-    the data leave open (a mass and a gear that matter by their ratio alone). Such combinations are named in a warning.
+    the data leave open (a mass and a gear that matter by their ratio alone).
     An entry of s that the data wrap, as an angle, is compared modulo 2 pi.
 
     Args:
@@ -226,77 +260,88 @@ def identify(
         The identified parameters with their errors; theta_0 itself for a model without parameters.
 
     Raises:
-        InvalidDataError: If the data have other dimensions than the MPC.
+        InvalidDataError: If the data have other dimensions than the MPC, or the model predicts none of them at all.
     """
+    return identify_plant(mpc, plant_rows(mpc, table), config, seed=seed)
+
+
+def identify_plant(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+) -> OneStepIdentification:
+    """As :func:`identify_one_step`, from a table of :func:`plant_rows`."""
     config = config or IdentificationConfig()
-    table.check_fits(mpc.nx, mpc.nu)
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
-    problem = OneStepProblem(mpc, _rows(mpc, table, config, rng), centre)
+    rows, episodes = _rows(mpc, table, config, rng)
+    problem = OneStepProblem(mpc, rows, centre)
     rows, unwrapped = without_jumps(problem.rows, problem.errors(mpc.theta) * problem.scale)
     if unwrapped:
         problem = OneStepProblem(mpc, rows, centre)
     if not problem.free.size:
-        return described(mpc, problem, np.zeros(0), np.zeros((0, 0)), config.prior_spread, unwrapped)
+        return described(mpc, problem, np.zeros(0), Misfit.nothing(), config.prior_spread, unwrapped)
     z, prior = _best_descent(problem, config, rng)
-    jacobian = problem.linearised(z)[1].reshape(-1, len(z))
-    information = jacobian.T @ jacobian / len(problem.rows.x) / (prior * config.prior_spread**2)
-    return described(mpc, problem, z, information, config.prior_spread, unwrapped)
+    variance = len(problem.rows.x) * prior * config.prior_spread**2
+    found = described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
+    if found.absurd[0] == len(rows.x):
+        raise problem.unpredictable("the best prediction of every row is more than 1000 increments off")
+    return found
+
+
+def _misfit(problem: OneStepProblem, z: Array, variance: float, episodes: NDArray[np.integer[Any]]) -> Misfit:
+    """The sum of squared errors over their variance, about z."""
+
+    def sum_of_squares(other: Array) -> float:
+        return float(np.sum(problem.linearised(other)[0] ** 2)) / variance
+
+    errors, jacobian = problem.linearised(z)
+    information = np.einsum("nip,niq->pq", jacobian, jacobian, optimize=True) / variance
+    scores = np.einsum("nip,ni->np", jacobian, errors) / variance
+    return Misfit(sum_of_squares, information, clusters(scores, episodes))
 
 
 def described(
-    mpc: MPC, problem: OneStepProblem, z: Array, information: Array, spread: float, unwrapped: tuple[int, ...] = ()
-) -> Identification:
-    """What was identified, with errors on the problem's rows; warns of what the user should know.
+    mpc: MPC, problem: OneStepProblem, z: Array, misfit: Misfit, spread: float, unwrapped: tuple[int, ...] = ()
+) -> OneStepIdentification:
+    """What was identified, with errors on the problem's rows.
 
     Args:
         mpc: The MPC; its parameters are theta_0.
         problem: The one-step prediction problem.
         z: The identified coordinates.
-        information: The data's information about z (the inverse of their covariance without the prior), ``(p, p)``.
+        misfit: What the data say about z.
         spread: Standard deviation of the prior.
         unwrapped: Coordinates that are wrapped angles.
     """
     theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
-    covariance, undetermined = _uncertainty(information, spread, problem.names)
+    errors = problem.errors(theta)
+    absurd = int(np.sum(~(np.abs(errors) <= ABSURD).all(axis=1)))
+    covariance, undetermined = uncertainty(misfit, z, (problem.low, problem.high), spread, problem.names)
     deviation = np.zeros_like(theta)
     identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
     deviation[identified] = np.sqrt(np.diag(covariance)) * np.abs(problem.slopes(z))
-    result = Identification(
+    return OneStepIdentification(
         theta,
         deviation,
         problem.scale,
         _root_mean_square(problem.errors(mpc.theta)),
-        _root_mean_square(problem.errors(theta)),
+        _root_mean_square(errors),
         tuple(name for name, bound in zip(problem.names, _at_bound(problem, z), strict=True) if bound),
         undetermined,
         unwrapped,
+        (absurd, len(errors)),
     )
-    _warn(result)
-    return result
 
 
-def increments_scale(x: Array, reached: Array, centre: Array | float = 0.0) -> Array:
-    """Spread of the increments of each coordinate ``(nx,)``; of the coordinate itself where nothing moves, else 1.
-
-    Args:
-        x: States, ``(n, nx)``.
-        reached: Those after them, ``(n, nx)``.
-        centre: What the table that they are from was packed without, ``(nx,)``: it was not rounded to float32.
-    """
-    spread = (reached - x).std(axis=0)
-    rounding, least = (1e-6 * np.abs(x - offset).max(axis=0) for offset in (centre, 0.0))
-    return np.where(spread > rounding, spread, np.where(least > 0.0, x.std(axis=0) + least, 1.0))
-
-
-def _rows(mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator) -> Rows:
-    """A random subset in float64, small enough for its Jacobian."""
+def _rows(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig, rng: np.random.Generator
+) -> tuple[Rows, NDArray[np.integer[Any]]]:
+    """A random subset in float64, small enough for its Jacobian, and the episode of each row."""
     n_parameters = max(1, int(mpc.space.mask(("model",)).sum()))
-    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * mpc.nx)))
+    count = min(config.rows, max(n_parameters, _MAX_ENTRIES // (n_parameters * table.ny)))
     sample = table.sample(count, rng)
     columns = sample.columns(sample.rows)
     parts = (columns.observations, columns.actions, columns.next_observations)
-    return Rows(*(np.asarray(part, dtype=np.float64) for part in parts))
+    return Rows(*(np.asarray(part, dtype=np.float64) for part in parts)), sample.episode_ids
 
 
 def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
@@ -306,7 +351,7 @@ def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
     """
     turns = np.round(np.nan_to_num(errors) / FULL_TURN)
     jumps = turns != 0.0
-    near = np.abs(errors - FULL_TURN * turns) < _NEAR_TURN
+    near = (np.abs(errors - FULL_TURN * turns) < _NEAR_TURN) & (np.abs(turns) <= _MOST_TURNS)
     confined = np.ptp(np.concatenate([rows.x, rows.reached]), axis=0) <= 1.05 * FULL_TURN
     count = jumps.sum(axis=0)
     wrapped = confined & (count > 0) & ((jumps & near).sum(axis=0) >= 0.9 * count)
@@ -335,24 +380,10 @@ def _best_descent(
             break
         start = 0.5 * config.prior_spread * rng.standard_normal(len(start))
     for _ in range(_PRIOR_ROUNDS):
-        prior = weight(float(np.sum(few.linearised(best.z)[0] ** 2)) / len(few.rows.x))
+        errors = few.linearised(best.z)[0]
+        prior = weight(float(np.sum(np.where(np.abs(errors) < ABSURD, errors, 0.0) ** 2)) / len(few.rows.x))
         best = few.descend(best.z, prior, config.max_iterations)
     return problem.descend(best.z, prior, config.max_iterations).z, prior
-
-
-def _uncertainty(information: Array, spread: float, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
-    """Covariance of z, and the combinations that stay about as uncertain as the prior."""
-    strengths, directions = np.linalg.eigh(information)
-    known = np.where(strengths > 1e-12 * strengths.max(initial=0.0), strengths, 0.0) * spread**2
-    covariance = spread**2 * (directions / (known + 1.0)) @ directions.T
-    return covariance, tuple(_combination(direction, names) for direction in directions[:, known < 3.0].T)
-
-
-def _combination(direction: Array, names: Sequence[str]) -> str:
-    """A direction in words: the parameters that it moves together, largest first."""
-    order = np.argsort(-np.abs(direction), kind="stable")
-    involved = [names[i] for i in order if abs(direction[i]) > 0.3 * np.abs(direction).max()]
-    return " with ".join(involved[:4]) + (" and others" if len(involved) > 4 else "")
 
 
 def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
@@ -361,14 +392,5 @@ def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
 
 def _root_mean_square(errors: Array) -> Array:
     """Of each coordinate ``(nx,)``, whatever the model predicts."""
-    finite = np.nan_to_num(errors, nan=_NOT_FINITE, posinf=_LARGEST, neginf=-_LARGEST)
-    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_LARGEST, _LARGEST) ** 2, axis=0)))
-
-
-def _warn(result: Identification) -> None:
-    if result.undetermined:
-        logger.warning("The data do not determine %s; kept near the given values.", ", nor ".join(result.undetermined))
-    if result.at_bound:
-        logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", result.at_bound)
-    if result.unwrapped:
-        logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(result.unwrapped))
+    finite = np.nan_to_num(errors, nan=ABSURD, posinf=ABSURD, neginf=-ABSURD)
+    return np.asarray(np.sqrt(np.mean(np.clip(finite, -ABSURD, ABSURD) ** 2, axis=0)))

@@ -60,6 +60,7 @@ class Filtered(NamedTuple):
         likelihood: Minus twice the log likelihood of the measurements, up to a constant.
         gradient: Half of its derivative in the model parameters, ``(p,)``, with gains held.
         information: The Gauss-Newton approximation of half of its second derivative, ``(p, p)``.
+        scores: The share of each trajectory in the gradient, ``(E, p)``.
     """
 
     x: Array
@@ -70,6 +71,7 @@ class Filtered(NamedTuple):
     likelihood: float
     gradient: Array
     information: Array
+    scores: Array
 
 
 def filtered(data: Linearised, measurement: Array, process: Array) -> Filtered:
@@ -92,7 +94,7 @@ def filtered(data: Linearised, measurement: Array, process: Array) -> Filtered:
     x, P = data.measured[0], weights[0][:, None, None] * R
     sensitivity = np.zeros_like(slopes[0])
     gradient, information = np.zeros(slopes.shape[-1]), np.zeros((slopes.shape[-1],) * 2)
-    likelihood = 0.0
+    scores, likelihood = np.zeros(sensitivity[:, 0].shape), 0.0
     history: list[tuple[Array, Array, Array, Array]] = []
     for t, valid in enumerate(data.valid):
         ahead = np.where(valid[:, None], data.ahead[t] + _times(F[t], x - data.about[t]), x)
@@ -110,11 +112,12 @@ def filtered(data: Linearised, measurement: Array, process: Array) -> Filtered:
             sensitivity = F[t] @ sensitivity + slopes[t]
             weighted = (S_inverse @ sensitivity)[heard]
             gradient -= np.tensordot(sensitivity, whitened, ((0, 1), (0, 1)))
+            scores -= _times(sensitivity.swapaxes(1, 2), whitened)
             information += np.tensordot(sensitivity[heard], weighted, ((0, 1), (0, 1)))
             sensitivity = sensitivity - gain @ sensitivity
     xs, Ps, x_ahead, Ps_ahead = (np.stack(parts) for parts in zip(*history, strict=True))
     xs, Ps = np.concatenate([xs, x[None]]), np.concatenate([Ps, P[None]])
-    return Filtered(xs, Ps, x_ahead, Ps_ahead, F, likelihood, gradient, information)
+    return Filtered(xs, Ps, x_ahead, Ps_ahead, F, likelihood, gradient, information, scores)
 
 
 def smoothed(found: Filtered) -> Array:

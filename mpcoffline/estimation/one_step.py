@@ -1,4 +1,8 @@
-"""The model's one-step prediction s+ = f_theta(s, a) and its derivatives, for many transitions at once."""
+"""The plant's one-step prediction s+ = f_theta(s, a) and its derivatives, for many transitions at once.
+
+Past inputs in an MPC's state are known exactly; what is estimated is the plant's map alone, whose inputs are those that
+act (:func:`~mpcoffline.datasets.table.memory.plant_table`).
+"""
 
 from __future__ import annotations
 
@@ -21,10 +25,11 @@ class OneStep:
     """
 
     def __init__(self, mpc: MPC, parameters: NDArray[np.bool_]) -> None:
-        f, index = mpc.dynamics_function, np.flatnonzero(parameters)
-        x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", len(parameters))
+        f, index, layout = mpc.plant_function, np.flatnonzero(parameters), mpc.layout
+        nx, nu = layout.n_states, len(layout.acting)
+        x, u, theta = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("theta", len(parameters))
         reached = f(x, u, theta)
-        self._shapes = ((mpc.nx,), (mpc.nx, len(index)), (mpc.nx, mpc.nx))
+        self._shapes = ((nx,), (nx, len(index)), (nx, nx))
         parts = [reached, ca.jacobian(reached, theta)[:, index.tolist()].T, ca.jacobian(reached, x).T]
         self._twins = [
             TorchTwin(ca.Function("one_step", [x, u, theta], [ca.vertcat(*(ca.vec(ca.densify(y)) for y in parts[:k]))]))

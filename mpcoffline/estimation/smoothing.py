@@ -6,7 +6,6 @@ worse, towards stage costs that fit the noise. A smoother with the identified mo
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,19 +15,21 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .identification import Identification, IdentificationConfig, OneStepProblem, described, identify
-from .kalman import Filtered, Linearised, filtered, smoothed
+from .identification import identify_one_step
+from .kalman import Linearised, filtered, smoothed
+from .plant import plant_rows, state_rows
 from .trajectories import Trajectories
 
-logger = logging.getLogger(__name__)
-
-#: Noise below this share of a coordinate's standard deviation is left in the data: it harms nothing.
+#: Noise below this share of a coordinate's standard deviation is left in the data: it harms nothing,
 NEGLIGIBLE = 0.01
+#: provided that it is below this share of the increments', too: a slow plant is sampled often.
+NEGLIGIBLE_STEP = 0.03
 
-_FEW_ROWS = 20_000  # on which the model is identified
+FEW_ROWS = 20_000  # on which the model is identified
 _FEWEST_PAIRS = 30  # of consecutive rows, for an estimate of the noise
 _SIGNIFICANT = 3.0  # standard errors above zero
 _LEAST_PROCESS = 1e-4  # of the increments' spread: keeps covariances regular
@@ -37,9 +38,7 @@ _CHUNK = 100_000  # rows that are smoothed at a time
 _FEWER_ROWS = 4_000  # on which the process noise is chosen
 _PROCESS_FACTORS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 _FAR = 10.0  # standard deviations of a measurement: no smoothing goes that far
-_ROUNDS = 5
 _SMOOTHINGS = 2
-_SETTLED = 1e-4  # change of the scaled parameters
 
 
 @dataclass(frozen=True)
@@ -53,12 +52,14 @@ class NoiseEstimate:
         source: What the estimate rests on: ``"repeated"`` where the data measure every state twice (s+ of a row and s
             of the next), ``"innovations"`` where these are one number, ``"unknown"`` where too few rows are
             consecutive.
+        increments: Standard deviation of the increment of each coordinate, ``(nx,)``; None where unknown.
     """
 
     measurement: Array
     process: Array
     spread: Array
     source: Literal["repeated", "innovations", "unknown"]
+    increments: Array | None = None
 
     @property
     def levels(self) -> Array:
@@ -75,22 +76,8 @@ class NoiseEstimate:
     @property
     def negligible(self) -> bool:
         """Whether the data may be used as they are."""
-        return self.level < NEGLIGIBLE
-
-
-@dataclass(frozen=True)
-class SmoothedIdentification:
-    """A model identified in spite of measurement noise, and the data without it.
-
-    Attributes:
-        identification: The model; its errors are those on the smoothed data.
-        table: The smoothed data; the given table itself where its noise is negligible.
-        noise: The noise found.
-    """
-
-    identification: Identification
-    table: TransitionTable
-    noise: NoiseEstimate
+        slow = self.increments is not None and bool((self.measurement > NEGLIGIBLE_STEP * self.increments).any())
+        return self.level < NEGLIGIBLE and not slow
 
 
 def with_measurement_noise(table: TransitionTable, level: float, seed: int) -> TransitionTable:
@@ -130,9 +117,9 @@ def estimate_noise(mpc: MPC, table: TransitionTable, theta: Array | None = None)
         table: The transitions, in the order of time within each episode.
         theta: The parameters of the model; identified from the table by default.
     """
-    found = identify(mpc, table) if theta is None else None
+    found = identify_one_step(mpc, table) if theta is None else None
     parameters, unwrapped = (found.theta, found.unwrapped) if found else (np.asarray(theta, np.float64), ())
-    return _noise(Trajectories.of(mpc, _excerpt(table, 0), unwrapped), parameters)
+    return noise_by_moments(Trajectories.of(mpc, excerpt(plant_rows(mpc, table), 0), unwrapped), parameters)
 
 
 def smooth(
@@ -158,8 +145,17 @@ def smooth(
         InvalidArgumentError: For a noise estimate of another size.
         StorageError: Where a memory map cannot be written.
     """
-    if noise.measurement.shape != (mpc.nx,):
-        raise InvalidArgumentError("noise", expected=f"{mpc.nx} coordinates", actual=str(noise.measurement.shape))
+    n_states = mpc.layout.n_states
+    if noise.measurement.shape != (n_states,):
+        raise InvalidArgumentError("noise", expected=f"{n_states} coordinates", actual=str(noise.measurement.shape))
+    table = state_rows(mpc, table)
+    return with_plant_states(table, smoothed_plant(mpc, plant_rows(mpc, table), theta, noise, unwrapped))
+
+
+def smoothed_plant(
+    mpc: MPC, table: TransitionTable, theta: Array, noise: NoiseEstimate, unwrapped: tuple[int, ...]
+) -> TransitionTable:
+    """As :func:`smooth`, of what the plant's map is given."""
     parts = (table.take(slice(start, start + _CHUNK)) for start in range(0, len(table), _CHUNK))
     smooth_parts = (
         part.with_states(*_smoothed_states(Trajectories.of(mpc, part, unwrapped), theta, noise)) for part in parts
@@ -167,57 +163,7 @@ def smooth(
     return table.rewritten((part.rows, part.episode_ids) for part in smooth_parts)
 
 
-def identify_smoothed(
-    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
-) -> SmoothedIdentification:
-    """Identifies the model from noisy data, and smooths the data with it.
-
-    One-step least squares first (:func:`identify`); where the noise that it finds is not negligible, the parameters
-    that make the data most likely under the extended Kalman filter, by Gauss-Newton on its innovations (Ljung, "System
-    Identification", ch. 7: a prediction-error method), noise and model estimated in turn.
-
-    Args:
-        mpc: The MPC; its parameters are theta_0.
-        table: The transitions, in the order of time within each episode. Rows that were left out are gaps.
-        config: Prior and effort.
-        seed: Seeds the choice of rows.
-
-    Returns:
-        Model, smoothed data and noise.
-
-    Raises:
-        InvalidDataError: If the data have other dimensions than the MPC.
-    """
-    config = config or IdentificationConfig()
-    first = identify(mpc, table, config, seed=seed)
-    few = Trajectories.of(mpc, _excerpt(table, seed), first.unwrapped).thinned(_FEW_ROWS, seed)
-    noise = _noise(few, first.theta)
-    if noise.source == "unknown" or noise.negligible:
-        return SmoothedIdentification(first, table, noise)
-    centre = table.centring.centre[: table.ny]
-    coordinates = OneStepProblem(mpc, few.rows(), centre)
-    z, information = coordinates.z(first.theta), np.zeros((0, 0))
-    about = few.measured
-    for _ in range(_ROUNDS):
-        data = few.linearised(coordinates.theta(z), about)
-        noise = _with_likely_process(few, data, _noise(few, coordinates.theta(z)))
-        found = filtered(data, *_filter_noise(few, noise))
-        step, information = _gauss_newton(found, coordinates, z, config.prior_spread)
-        z, about = np.clip(z + step, coordinates.low, coordinates.high), smoothed(found)
-        if np.abs(step).max(initial=0.0) < _SETTLED:
-            break
-    if not _likelihood(few, coordinates.theta(z), noise) <= _likelihood(few, first.theta, noise):
-        z = coordinates.z(first.theta)
-    logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
-    result = smooth(mpc, table, coordinates.theta(z), noise, unwrapped=first.unwrapped)
-    clean = Trajectories.of(mpc, _excerpt(result, seed), first.unwrapped)
-    identification = described(
-        mpc, OneStepProblem(mpc, clean.rows(), centre), z, information, config.prior_spread, first.unwrapped
-    )
-    return SmoothedIdentification(identification, result, noise)
-
-
-def _noise(problem: Trajectories, theta: Array) -> NoiseEstimate:
+def noise_by_moments(problem: Trajectories, theta: Array) -> NoiseEstimate:
     """Measurement and process noise by moments; see :func:`estimate_noise`."""
     valid, scale = problem.valid, problem.scale
     pairs = valid[:, :-1] & valid[:, 1:]
@@ -238,7 +184,8 @@ def _noise(problem: Trajectories, theta: Array) -> NoiseEstimate:
     passed_on = np.einsum("nij,j->i", F**2, variances) / len(F)
     process = np.sqrt(np.maximum(np.mean(errors**2, axis=0) - variances - passed_on, 0.0))
     source: Literal["repeated", "innovations"] = "repeated" if problem.repeated else "innovations"
-    return NoiseEstimate(scale * np.sqrt(variances), scale * process, problem.spread, source)
+    increments = (problem.reached - problem.s)[valid].std(axis=0)
+    return NoiseEstimate(scale * np.sqrt(variances), scale * process, problem.spread, source, increments)
 
 
 def _lagged_variances(problem: Trajectories, errors: Array, F: Array) -> Array:
@@ -261,14 +208,14 @@ def _lagged_variances(problem: Trajectories, errors: Array, F: Array) -> Array:
     return np.asarray(np.where(mean > _SIGNIFICANT * standard_error, mean / np.maximum(squares, 1e-12), 0.0))
 
 
-def _filter_noise(problem: Trajectories, noise: NoiseEstimate) -> tuple[Array, Array]:
+def filter_noise(problem: Trajectories, noise: NoiseEstimate) -> tuple[Array, Array]:
     """Measurement and process noise in the filter's units, kept regular."""
     increments = (problem.reached - problem.s)[problem.valid].std(axis=0)
     least = _LEAST_PROCESS * np.maximum(increments, 1e-3 * problem.scale)
     return noise.measurement / problem.scale, np.maximum(noise.process, least) / problem.scale
 
 
-def _with_likely_process(problem: Trajectories, data: Linearised, noise: NoiseEstimate) -> NoiseEstimate:
+def with_likely_process(problem: Trajectories, data: Linearised, noise: NoiseEstimate) -> NoiseEstimate:
     """The estimate with the process noise scaled to the largest likelihood: moments resolve no small one."""
     step = max(1, int(data.valid.sum()) // _FEWER_ROWS)
     few = data.every(step)
@@ -276,32 +223,18 @@ def _with_likely_process(problem: Trajectories, data: Linearised, noise: NoiseEs
     best, best_likelihood = noise, np.inf
     for factor in _PROCESS_FACTORS:
         candidate = replace(noise, process=factor * process)
-        likelihood = filtered(few, *_filter_noise(problem, candidate)).likelihood
+        likelihood = filtered(few, *filter_noise(problem, candidate)).likelihood
         if not likelihood < best_likelihood:
             break
         best, best_likelihood = candidate, likelihood
     return best
 
 
-def _gauss_newton(found: Filtered, coordinates: OneStepProblem, z: Array, spread: float) -> tuple[Array, Array]:
-    """The Gauss-Newton step of z on the likelihood and the prior, and the information of the data."""
-    slopes, free = coordinates.slopes(z), coordinates.free
-    information = found.information[np.ix_(free, free)] * np.outer(slopes, slopes)
-    gradient = found.gradient[free] * slopes + z / spread**2
-    step = -np.asarray(np.linalg.solve(information + np.eye(len(z)) / spread**2, gradient), dtype=np.float64)
-    return step / max(1.0, float(np.abs(step).max(initial=0.0))), information
-
-
-def _likelihood(problem: Trajectories, theta: Array, noise: NoiseEstimate) -> float:
-    """Minus twice the log likelihood of the data under a model."""
-    return filtered(problem.linearised(theta, problem.measured), *_filter_noise(problem, noise)).likelihood
-
-
 def _smoothed_states(problem: Trajectories, theta: Array, noise: NoiseEstimate) -> Array:
     """States s and s+ of every row, ``(2, n, nx)``; what comes out far from what was measured stays as it was."""
     x = problem.measured
     for _ in range(_SMOOTHINGS):
-        x = smoothed(filtered(problem.linearised(theta, x), *_filter_noise(problem, noise)))
+        x = smoothed(filtered(problem.linearised(theta, x), *filter_noise(problem, noise)))
     far = np.abs(x - problem.measured) * problem.scale > _FAR * noise.measurement + 1e-9 * problem.scale
     x = np.where((~np.isfinite(x) | far).any(axis=2, keepdims=True), problem.measured, x) * problem.scale
     x = x.swapaxes(0, 1)
@@ -312,9 +245,9 @@ def _smoothed_states(problem: Trajectories, theta: Array, noise: NoiseEstimate) 
     return states
 
 
-def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
+def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
     """The table, or of a large one some stretches of consecutive rows."""
-    n_blocks, wanted = -(-len(table) // _BLOCK), 2 * _FEW_ROWS // _BLOCK
+    n_blocks, wanted = -(-len(table) // _BLOCK), 2 * FEW_ROWS // _BLOCK
     if n_blocks <= wanted:
         return table
     chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])

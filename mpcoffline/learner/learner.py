@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
@@ -17,6 +18,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 
@@ -33,6 +35,8 @@ Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
 #: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
 #: ends the fit there. One with a method ``on_fit_end()`` has it called when the fit ends, for whatever reason.
 Callback = Callable[["OfflineMPCLearner", int, int], Any]
+
+logger = logging.getLogger(__name__)
 
 _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
 
@@ -67,7 +71,8 @@ class OfflineMPCLearner:
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
             ``mpcoffline.learning.VALUE_METHODS``, or a method itself; overrides the preset.
-        value_function: A V_phi learned before (of the same data and discount); (VALUE) is skipped.
+        value_function: A V_phi learned before, of the same data and discount, and of the MPC's state; (VALUE) is
+            skipped, and no dead time is looked for.
         device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
         **options: Any option of the method, e.g. ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; what two stages
             have takes the name of the stage in front (``value_n_steps``, ``fit_n_steps``). ``learner.method.options``
@@ -125,6 +130,8 @@ class OfflineMPCLearner:
     def __repr__(self) -> str:
         """What it learns, how, and whether it has."""
         state = "fitted" if self.result is not None else "not fitted"
+        if isinstance(self._mpc, MPC) and any(self._mpc.layout.delay):
+            state += f", dead time {list(self._mpc.layout.delay)}"
         how = f"method={type(self.method).__name__}" if self.preset is None else f"preset={self.preset!r}"
         return f"{type(self).__name__}(learn={self.learn!r}, {how}, seed={self.seed}; {state})"
 
@@ -140,6 +147,8 @@ class OfflineMPCLearner:
         show_progress: bool = True,
     ) -> History:
         """Learns, stage by stage: by all presets V_phi, then theta.
+
+        First :func:`mpcoffline.check` compares the MPC with the data, and what it finds likely is logged as a warning.
 
         Args:
             dataset: A Minari data set, the id of one, or a table of transitions.
@@ -160,7 +169,8 @@ class OfflineMPCLearner:
             ``fit_loss``.
 
         Raises:
-            InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
+            InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds, or
+                :func:`mpcoffline.check` is certain of a contradiction.
             InvalidArgumentError: If the checkpoint is of another fit, the given V_phi of another discount, or
                 ``dataset`` something else.
             UnknownIdError: For an unknown data set id.
@@ -195,6 +205,10 @@ class OfflineMPCLearner:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
         method = self.method if n_steps is None else self.method.replaced({"value_n_steps": n_steps})
         table, observation_space = self._table(dataset)
+        report = check(self.nominal_mpc, table)
+        report.raise_for_errors()
+        for finding in report.warnings:
+            logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
@@ -319,7 +333,7 @@ class OfflineMPCLearner:
                 learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
                 if document["value_given"]:
                     learner._given_value_function = learner.value_function
-                if learner.value_function.ny != learner.nominal_mpc.nx:
+                if learner.value_function.ny not in (nominal.nx, (learner.mpc if document["learned"] else nominal).nx):
                     raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
         return learner
 

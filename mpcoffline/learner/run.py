@@ -15,7 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
+from mpcoffline.learning.ends import innermost
 from mpcoffline.learning.stages import Arrays, Change
 from mpcoffline.mpc import MPC
 
@@ -56,10 +58,10 @@ class Run:
 
     def __init__(self, method: Method, start: Known) -> None:
         mpc = start.mpc
-        start.table.check_fits(mpc.nx, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
+        start.table.check_fits(mpc.ny, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
         _check_device(start.device)
         self.method, self._start = method, start
-        self._mpc = method.restructured(mpc)
+        self._mpc = method.restructured(mpc.replace(model=mpc.model.suited_to_log(start.table)))
         _check_discount(start.value_function, self._mpc.discount)
         self._outcome: Callable[[], Known] | None = None
         self.value_function = start.value_function
@@ -77,7 +79,7 @@ class Run:
             InvalidDataError: If the data do not fit.
             MPCOfflineError: If a regression fails.
         """
-        known = replace(self._start, mpc=self._mpc, table=self._start.table.trim(self.method.trim))
+        known = self._prepared()
         stages, total = list(self.method.stages().items()), 0
         while stages:
             (name, stage), *stages = stages
@@ -103,6 +105,13 @@ class Run:
             self.value_function = known.value_function
         self._outcome, self.result = lambda: _complete(known), _complete(known).result
         yield Epoch("learning", 1, 1, total + 1, {})
+
+    def _prepared(self) -> Known:
+        """What the stages begin with: past inputs beside the observations where the MPC holds some, then trimmed."""
+        known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
+        table = with_memory(known.table, known.mpc.layout)
+        n = known.mpc.layout.n_states
+        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n))
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

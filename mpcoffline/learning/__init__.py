@@ -5,9 +5,10 @@ from __future__ import annotations
 from .bellman.method import Bellman
 from .bellman.regression import ParameterConfig, ParameterTraining, fit_parameters
 from .bellman.stages import StartConfig, TerminalConfig
+from .known_cost import CostConfig, known_cost
 from .method import METHODS, Method
 from .paper import Paper
-from .stages import FitResult, Known, Stage, Training
+from .stages import FitResult, Known, KnownCost, Stage, Training
 from .terminal import DistillConfig, TerminalError, fit_terminal, terminal_error
 from .value.fit import VALUE_METHODS, ValueConfig, ValueFunction, ValueMethod, ValueTraining, fit_value
 from .value.noise import Stochasticity, estimate_stochasticity
@@ -16,9 +17,11 @@ __all__ = [
     "METHODS",
     "VALUE_METHODS",
     "Bellman",
+    "CostConfig",
     "DistillConfig",
     "FitResult",
     "Known",
+    "KnownCost",
     "Method",
     "Paper",
     "ParameterConfig",
@@ -37,5 +40,6 @@ __all__ = [
     "fit_parameters",
     "fit_terminal",
     "fit_value",
+    "known_cost",
     "terminal_error",
 ]

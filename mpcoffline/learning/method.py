@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
@@ -16,7 +17,8 @@ from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.registry import Registry
 from mpcoffline.mpc import MPC, QuadraticCost
 
-from .stages import Change, Stage
+from .linear_quadratic import is_linear_quadratic
+from .stages import Change, Known, Stage
 
 _log = logging.getLogger(__name__)
 
@@ -41,8 +43,12 @@ class Method(ABC):
     Attributes:
         trim: Share of the transitions that is learned from; the farthest out are left out.
         discount: gamma of V and of the learned MPC; None keeps the given MPC's.
-        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken.
-        horizon: N of the learned MPC; None keeps the given one's.
+        least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken: a small discount hides
+            goals that are far. A linear-quadratic MPC, which sees any distance, keeps its own.
+        horizon: N of the learned MPC; None keeps the given one's, or what ``least_horizon`` makes of it.
+        least_horizon: Where ``horizon`` is None, a horizon that leaves more to V, and is faster: this one at
+            ``least_discount``, and where the discount is larger as many steps as it takes for gamma^N to fall as low,
+            but no more than the given MPC has.
         cross_term: Whether the quadratic stage cost gets a cross term S.
     """
 
@@ -50,6 +56,7 @@ class Method(ABC):
     discount: float | None = None
     least_discount: float = 0.0
     horizon: int | None = None
+    least_horizon: int | None = None
     cross_term: bool = False
 
     def __post_init__(self) -> None:
@@ -59,10 +66,16 @@ class Method(ABC):
         check_number("least_discount", self.least_discount, 0.0, 1.0, open_low=False)
         if self.horizon is not None:
             check_integers(1, horizon=self.horizon)
+        if self.least_horizon is not None:
+            check_integers(1, least_horizon=self.least_horizon)
 
     @abstractmethod
     def stages(self) -> dict[str, Stage | Change]:
         """The stages by name, in their order; one without steps is a function from ``Known`` to ``Known``."""
+
+    def prepared(self, known: Known) -> Known:
+        """What the stages begin with, found from all transitions; by default what is known already."""
+        return known
 
     @property
     def name(self) -> str:
@@ -140,18 +153,29 @@ class Method(ABC):
 
     def restructured(self, nominal: MPC) -> MPC:
         """The MPC with the discount, the horizon and the form of stage cost that the options ask for."""
-        discount = max(nominal.discount, self.least_discount) if self.discount is None else self.discount
-        horizon = nominal.horizon if self.horizon is None else self.horizon
-        mpc = nominal.replace(discount=discount, horizon=horizon)
+        least = 0.0 if is_linear_quadratic(nominal) else self.least_discount
+        discount = max(nominal.discount, least) if self.discount is None else self.discount
+        mpc = nominal.replace(discount=discount, horizon=self._horizon(nominal.horizon, discount))
         cost = nominal.stage_cost
         if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
             values, cross = cost.values, np.zeros((cost.nx, cost.nu))
             constant = float(values["constant"])
-            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant)
+            references = values["x_ref"], values["u_ref"]
+            D = values.get("D")
+            crossed = QuadraticCost(cost.W, cost.R, cross, *references, constant, D=D, tracks=cost.tracks)
             return mpc.replace(stage_cost=crossed)
         if self.cross_term:
             _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")
         return mpc
+
+    def _horizon(self, given: int, discount: float) -> int:
+        """N of the learned MPC."""
+        if self.horizon is not None or self.least_horizon is None:
+            return given if self.horizon is None else self.horizon
+        if not 0.0 < self.least_discount < discount < 1.0:
+            return self.least_horizon if discount < 1.0 else max(given, self.least_horizon)
+        alike = self.least_horizon * math.log(self.least_discount) / math.log(discount)
+        return max(self.least_horizon, min(given, math.ceil(alike)))
 
 
 def _described(option: Any) -> Any:

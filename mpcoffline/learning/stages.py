@@ -33,6 +33,8 @@ class FitResult:
         loss_after: The same at theta.
         at_bounds: Names of the learned parameters that ended on a bound.
         potential: The potential that was fitted with the cost, if one was.
+        residual_share: The share of what the identified model missed that a learned residual explains; None where the
+            model has none.
     """
 
     theta: NDArray[np.float64]
@@ -40,6 +42,7 @@ class FitResult:
     loss_after: float
     at_bounds: tuple[str, ...] = ()
     potential: Potential | None = None
+    residual_share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description, without theta."""
@@ -48,6 +51,7 @@ class FitResult:
             "loss_after": self.loss_after,
             "at_bounds": list(self.at_bounds),
             "potential": None if self.potential is None else self.potential.to_json(),
+            "residual_share": self.residual_share,
         }
 
     @classmethod
@@ -55,7 +59,36 @@ class FitResult:
         """The inverse of :meth:`to_json`."""
         potential = None if data["potential"] is None else Potential.from_json(data["potential"])
         at_bounds = tuple(map(str, data["at_bounds"]))
-        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential)
+        share = None if data["residual_share"] is None else float(data["residual_share"])
+        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential, share)
+
+
+@dataclass(frozen=True)
+class KnownCost:
+    """How the logged costs L follow from the MPC's stage cost: ``L = scale Lhat + offset``.
+
+    Attributes:
+        scale: Positive.
+        offset: In the unit of the logged costs.
+        missed: Share of the variance of the logged costs that is not explained.
+        agreeing: Share of the transitions that it holds for.
+        constant: Whether all logged costs are one number, so that they say nothing about Lhat.
+    """
+
+    scale: float = 1.0
+    offset: float = 0.0
+    missed: float = 0.0
+    agreeing: float = 1.0
+    constant: bool = False
+
+    def __str__(self) -> str:
+        """The relation, in words."""
+        if self.constant:
+            return "L is the same in all transitions that do not end an episode"
+        relation = "Lhat" if self.scale == 1.0 else f"{self.scale:.4g} Lhat"
+        offset = f" {self.offset:+.3g}" if self.offset else ""
+        where = "" if self.agreeing == 1.0 else f" in {self.agreeing:.0%} of the transitions"
+        return f"L = {relation}{offset}{where}, up to {self.missed:.1g} of Var[L]"
 
 
 @dataclass(frozen=True)
@@ -65,12 +98,16 @@ class Known:
     Attributes:
         mpc: The MPC with what is learned of it so far.
         table: The transitions, without what was taken out of them so far.
+        given: MPC_1, of which the method may have changed horizon and discount.
         groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
         seed: Seeds everything.
         device: Torch device for what is large.
         value_function: V_phi, given or learned; None before.
+        cost: How the logged costs follow from the MPC's stage cost, which then is not learned; None where it is.
         model_error: What the model misses in one step, as share of an increment (root mean square); None where it was
             not identified.
+        residual_share: The share of what the identified model missed that a learned residual explains; None where the
+            model has none.
         result: What the fit found; the last stage leaves one.
     """
 
@@ -80,8 +117,11 @@ class Known:
     seed: int = 0
     device: str = "cpu"
     value_function: ValueFunction | None = None
+    cost: KnownCost | None = None
     model_error: float | None = None
+    residual_share: float | None = None
     result: FitResult | None = None
+    given: MPC | None = None
 
     @property
     def constant_value(self) -> ValueFunction:

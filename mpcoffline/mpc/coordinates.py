@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import torch
 from torch import Tensor
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
+
+from .scaling import Scaling
 
 _OFF_SADDLE = 0.1  # in scaled coordinates
 _AT_BOUND = 1e-6  # likewise
@@ -16,17 +19,18 @@ _AT_BOUND = 1e-6  # likewise
 class Coordinates:
     """Scaled coordinates z of the learned part of theta, in which a step of one size means the same everywhere.
 
-    A parameter with a positive lower bound (a mass, a length) is learned by its logarithm; the entries of a row of a
-    matrix factor are measured in the size of that row, other numbers in the size of their block. Bounds on theta
-    become bounds on z. The factor C of a matrix C C' is free here: the sign of a column means nothing, and a diagonal
-    held at zero would block the way to the same matrix with the column reversed; :func:`canonical` restores the signs.
+    A parameter with a positive lower bound (a mass, a length) is learned by its logarithm, all others in the units of
+    :meth:`~mpcoffline.mpc.scaling.Scaling.units`. Bounds on theta become bounds on z. The factor C of a matrix C C' is
+    free here: the sign of a column means nothing, and a diagonal held at zero would block the way to the same matrix
+    with the column reversed; :func:`canonical` restores the signs.
 
     Args:
         mpc: The MPC; its parameters are theta_0, and z = 0 there.
         groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
+        scaling: The units of the data.
     """
 
-    def __init__(self, mpc: MPC, groups: tuple[str, ...]) -> None:
+    def __init__(self, mpc: MPC, groups: tuple[str, ...], scaling: Scaling) -> None:
         space = mpc.space
         self.mask = space.mask(groups)
         theta, low, high = (v[self.mask] for v in (space.theta, space.low, space.high))
@@ -36,8 +40,8 @@ class Coordinates:
         self._bounds = np.stack([low, high], axis=1)
         self._names = [name for name, learned in zip(space.names, self.mask, strict=True) if learned]
         self.logarithmic = (low > 0.0) & (theta > 0.0)
-        scale = np.concatenate([_block_scale(block.theta, block.kind) for block in space])[self.mask]
-        self.scale = np.where(self.logarithmic, 1.0, scale)
+        self._sizes = scaling.units(mpc, groups)[self.mask]
+        self.scale = np.where(self.logarithmic, 1.0, self._sizes)
         self._theta_0 = theta
         self._full = space.theta
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -78,22 +82,9 @@ class Coordinates:
         """Names of the learned parameters that lie on one of their bounds."""
         learned = theta[self.mask]
         bounds = np.nan_to_num(self._bounds, posinf=np.nan, neginf=np.nan)
-        near = np.abs(learned[:, None] - bounds) <= _AT_BOUND * (1.0 + np.abs(bounds))
+        near = np.abs(learned[:, None] - bounds) <= _AT_BOUND * np.fmax(np.abs(bounds), self._sizes[:, None])
         near &= (self._bounds[:, 0] < self._bounds[:, 1])[:, None]  # a fixed parameter is where it has to be
         return [name for name, on in zip(self._names, near.any(axis=1), strict=True) if on]
-
-
-def _block_scale(theta: Array, kind: str) -> Array:
-    """The size of each coordinate of a block: its row's for a matrix factor, otherwise the block's largest entry."""
-    if kind != "psd":
-        return np.full(len(theta), float(np.abs(theta).max(initial=0.0)) or 1.0)
-    n = round((np.sqrt(8 * len(theta) + 1) - 1) / 2)
-    rows, columns = np.tril_indices(n)
-    factor = np.zeros((n, n))
-    factor[rows, columns] = theta
-    sizes = np.linalg.norm(factor, axis=1)
-    largest = sizes.max() or 1.0
-    return np.asarray(np.maximum(sizes, 0.1 * largest)[rows])
 
 
 def canonical(mpc: MPC, theta: Array) -> Array:
@@ -106,3 +97,22 @@ def canonical(mpc: MPC, theta: Array) -> Array:
             signs = np.where(theta[part][rows == columns] < 0.0, -1.0, 1.0)
             result[part] = theta[part] * signs[columns]
     return np.clip(result, mpc.space.low, mpc.space.high)
+
+
+def with_level(mpc: MPC, theta: Array, level: float) -> Array:
+    """The parameters with a constant added to the stage cost, where it has a parameter that adds one.
+
+    Args:
+        mpc: The MPC.
+        theta: All parameters, ``(size,)``.
+        level: What is added to Lhat, everywhere alike.
+    """
+    x, u, p = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", len(theta))
+    slopes = ca.densify(ca.jacobian(mpc.stage_function(x, u, p), p))
+    result = theta.copy()
+    for k in np.flatnonzero(mpc.space.mask(("cost",))):
+        slope = slopes[int(k)]
+        if slope.is_constant() and float(slope) != 0.0:
+            result[k] = np.clip(theta[k] + level / float(slope), mpc.space.low[k], mpc.space.high[k])
+            break
+    return result

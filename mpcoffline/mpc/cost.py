@@ -15,6 +15,7 @@ from mpcoffline.core.types import Array
 
 from .component import COSTS, Component, blocks_from_json, difference, numbers, vector
 from .parameters import Block, ParameterSpace
+from .signals import Named
 
 
 @COSTS.register("QuadraticCost")
@@ -28,6 +29,12 @@ class QuadraticCost(Component):
     and as a terminal cost e'We + constant. Without ``S`` the matrices W and R are parameters of their own
     (the paper's form); with ``S`` the whole matrix H = [[W, S], [S', R]] is one.
 
+    With ``D`` a stage cost has a price on changes of the inputs besides (do-mpc's ``rterm``)::
+
+        (u - u_before)'D(u - u_before),        D positive semidefinite
+
+    where ``u_before`` is the input of the step before, which the MPC then carries in its state.
+
     Args:
         W: State weight, ``(nx, nx)``.
         R: Input weight, ``(nu, nu)``; without it inputs are free of cost.
@@ -35,9 +42,12 @@ class QuadraticCost(Component):
         x_ref: State reference, ``(nx,)``; zero by default.
         u_ref: Input reference, ``(nu,)``; zero by default.
         constant: The offset theta_3 of (COST).
+        D: Weight of changes of the inputs, ``(nu, nu)``; needs ``R``.
+        tracks: Which states follow which signals, ``{1: "set_point"}``: e_1 = x_1 - d.set_point - x_ref_1.
 
     Raises:
-        InvalidArgumentError: If shapes do not fit, or the weights are not symmetric positive semidefinite.
+        InvalidArgumentError: If shapes do not fit, what tracks a signal is no state, or the weights are not symmetric
+            positive semidefinite.
     """
 
     convex: ClassVar[bool] = True
@@ -50,27 +60,39 @@ class QuadraticCost(Component):
         x_ref: ArrayLike | None = None,
         u_ref: ArrayLike | None = None,
         constant: float = 0.0,
+        D: ArrayLike | None = None,
+        tracks: Mapping[int, str] | None = None,
     ) -> None:
         weight = np.atleast_2d(numbers("W", W))
         nx = weight.shape[0]
         blocks: list[Block] = []
         nu = 0
         if R is None:
-            if S is not None or u_ref is not None:
-                raise InvalidArgumentError("R", expected="a matrix, as S or u_ref is given", actual="None")
+            if S is not None or u_ref is not None or D is not None:
+                raise InvalidArgumentError("R", expected="a matrix, as S, D or u_ref is given", actual="None")
             blocks.append(Block.psd("W", weight, "cost"))
         else:
             input_weight = np.atleast_2d(numbers("R", R))
             nu = input_weight.shape[0]
             blocks += _weight_blocks(weight, input_weight, S)
+            if D is not None:
+                change_weight = np.atleast_2d(numbers("D", D))
+                if change_weight.shape != (nu, nu):
+                    raise InvalidArgumentError("D", expected=f"shape {(nu, nu)}", actual=f"shape {change_weight.shape}")
+                blocks.append(Block.psd("D", change_weight, "cost"))
             blocks.append(Block.free("u_ref", vector("u_ref", u_ref, nu), "reference"))
         blocks.append(Block.free("x_ref", vector("x_ref", x_ref, nx), "reference"))
         offset = numbers("constant", constant)
         if offset.ndim > 0:
             raise InvalidArgumentError("constant", expected="one number", actual=f"shape {offset.shape}")
         blocks.append(Block.free("constant", offset, "cost"))
-        self.nx, self.nu = nx, nu
+        self.nx, self.nu, self.tracks = nx, nu, _checked_tracks(tracks or {}, nx)
         self.space = ParameterSpace(blocks)
+
+    @property
+    def uses_signals(self) -> bool:
+        """Whether a state follows a signal."""
+        return bool(self.tracks)
 
     @property
     def W(self) -> Array:
@@ -89,6 +111,11 @@ class QuadraticCost(Component):
         n = len(self.W)
         return self._weights()[:n, n:]
 
+    @property
+    def uses_previous(self) -> bool:
+        """Whether changes of the inputs have a price."""
+        return "D" in self.values
+
     def _weights(self) -> Array:
         """The matrix H ``(nx + nu, nx + nu)``."""
         values = self.values
@@ -96,8 +123,25 @@ class QuadraticCost(Component):
             return values["H"]
         return scipy.linalg.block_diag(values["W"], values["R"]) if "R" in values else values["W"]
 
-    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
-        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that ``e'We = |C'e|^2``."""
+    def expression(
+        self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX], previous: ca.SX | None = None, d: Named | None = None
+    ) -> ca.SX:
+        """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that ``e'We = |C'e|^2``.
+
+        Args:
+            x: State, ``(nx, 1)``.
+            u: Inputs, ``(nu, 1)``.
+            p: The parameters.
+            previous: The inputs of the step before, ``(nu, 1)``; where there is no ``D``, they are not asked for.
+            d: The present signals; where nothing tracks one, they are not asked for.
+        """
+        cost = self._stationary(self._away(x, d), u, p)
+        if previous is not None and "D" in p:
+            cost = cost + ca.sumsqr(p["D"].T @ difference("u", u, previous))
+        return cost
+
+    def _stationary(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """(COST) without what changes of the inputs cost."""
         e = self._error(x, p)
         if "H" in p:
             return ca.sumsqr(p["H"].T @ ca.vertcat(e, difference("u", u, p["u_ref"]))) + p["constant"]
@@ -106,15 +150,25 @@ class QuadraticCost(Component):
             cost += ca.sumsqr(p["R"].T @ difference("u", u, p["u_ref"]))
         return cost
 
-    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX], d: Named | None = None) -> ca.SX:
         """The terminal cost e'We + constant as a CasADi scalar."""
-        e = self._error(x, p)
+        e = self._error(self._away(x, d), p)
         factor = p["W"] if "W" in p else p["H"][: e.numel(), :]
         return ca.sumsqr(factor.T @ e) + p["constant"]
 
     def _error(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """What W weighs: e = x - x_ref."""
         return difference("x", x, p["x_ref"])
+
+    def _away(self, x: ca.SX, d: Named | None) -> ca.SX:
+        """The state, those that track a signal as their distance from it."""
+        if d is None or not self.tracks:
+            return x
+        return x - ca.vertcat(*(d[self.tracks[i]] if i in self.tracks else 0.0 for i in range(x.numel())))
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description."""
+        return super().to_json() | {"tracks": [[i, name] for i, name in self.tracks.items()]}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
@@ -124,6 +178,7 @@ class QuadraticCost(Component):
         values = cost.values
         cost.nx = len(values["x_ref"])
         cost.nu = len(values["u_ref"]) if "u_ref" in values else 0
+        cost.tracks = _checked_tracks(dict(data["tracks"]), cost.nx)
         return cost
 
 
@@ -169,6 +224,13 @@ class NormCost(Component):
         cost.space = blocks_from_json(data)
         cost.nx = len(cost.values["x_ref"])
         return cost
+
+
+def _checked_tracks(tracks: Mapping[int, str], nx: int) -> dict[int, str]:
+    for i, name in tracks.items():
+        if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < nx or not isinstance(name, str):
+            raise InvalidArgumentError("tracks", expected=f"names of signals by state, 0 to {nx - 1}", actual=f"{i!r}")
+    return dict(tracks)
 
 
 def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:

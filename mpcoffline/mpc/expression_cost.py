@@ -14,7 +14,9 @@ from mpcoffline.core.limits import check_limit
 
 from .component import COSTS, Component, StageCost, TerminalCost, blocks_from_json
 from .expressions import function_from_json, function_to_json, traced
+from .layout import Layout
 from .parameters import ParameterSpace
+from .seen import stage_expression, terminal_expression
 
 
 @COSTS.register("ExpressionCost")
@@ -32,6 +34,7 @@ class ExpressionCost(Component):
 
     def __init__(self, function: ca.Function, space: ParameterSpace, *, convex: bool = False) -> None:
         self.function, self.space, self.convex = traced("cost", function), space, convex
+        self.nx = self.function.numel_in(0)
 
     def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """The stage cost as a CasADi scalar.
@@ -71,14 +74,14 @@ class ExpressionCost(Component):
 
 
 def cost_to_json(
-    cost: StageCost | TerminalCost, nx: int, nu: int | None = None, *, portable: bool = False
+    cost: StageCost | TerminalCost, layout: Layout, *, stage: bool, portable: bool = False
 ) -> dict[str, Any]:
     """A cost as its class writes it, or, where no file can name that class, by its expression.
 
     Args:
         cost: The cost.
-        nx: Number of states.
-        nu: Number of inputs; None for a terminal cost.
+        layout: What the state of its problem is made of.
+        stage: Whether it is a stage cost.
         portable: Whether classes from outside this package are written by their expression, too.
 
     Raises:
@@ -87,11 +90,10 @@ def cost_to_json(
     own: Any = cost
     if name := COSTS.name_of(type(cost), shared=portable):
         return dict(own.to_json()) | {"kind": name}
-    theta = ca.SX.sym("theta", cost.space.size)
-    variables = [ca.SX.sym("x", nx), *([] if nu is None else [ca.SX.sym("u", nu)])]
-    write = own.terminal_expression if nu is None else own.expression
-    value = ca.densify(ca.SX(write(*variables, cost.space.symbols(theta))))
-    function = ca.Function("cost", [*variables, theta], [value])
+    z, u, theta = ca.SX.sym("x", layout.nx), ca.SX.sym("u", layout.nu), ca.SX.sym("theta", cost.space.size)
+    p = cost.space.symbols(theta)
+    value = stage_expression(layout, own, z, u, p) if stage else terminal_expression(layout, own, z, p)
+    function = ca.Function("cost", [z, u, theta] if stage else [z, theta], [ca.densify(value)])
     return ExpressionCost(function, cost.space, convex=bool(getattr(cost, "convex", False))).to_json()
 
 

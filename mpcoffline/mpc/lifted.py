@@ -45,6 +45,7 @@ class LiftedCost(QuadraticCost):
         S: Cross weight, ``(m, nu)``; needs ``R``.
         u_ref: Input reference, ``(nu,)``; zero by default.
         constant: The offset theta_3 of (COST).
+        D: Weight of changes of the inputs, ``(nu, nu)``, as in :class:`QuadraticCost`; needs ``R``.
 
     Raises:
         InvalidArgumentError: If shapes do not fit, the weights are not symmetric positive semidefinite, or CasADi
@@ -62,8 +63,9 @@ class LiftedCost(QuadraticCost):
         S: ArrayLike | None = None,
         u_ref: ArrayLike | None = None,
         constant: float = 0.0,
+        D: ArrayLike | None = None,
     ) -> None:
-        super().__init__(W, R, S, u_ref=u_ref, constant=constant)
+        super().__init__(W, R, S, u_ref=u_ref, constant=constant, D=D)
         n_features = self.nx
         self.nx = np.size(np.asarray(x_ref))
         reference = Block.free("x_ref", vector("x_ref", x_ref, self.nx), "reference")
@@ -95,7 +97,7 @@ class LiftedCost(QuadraticCost):
         W = scipy.linalg.block_diag(cost.W, np.zeros((more, more)))
         S = np.vstack([cost.S, np.zeros((more, nu))]) if "H" in values else None
         R, u_ref = (cost.R, values["u_ref"]) if nu else (None, None)
-        return cls(features, values["x_ref"], W, R, S, u_ref, float(values["constant"]))
+        return cls(features, values["x_ref"], W, R, S, u_ref, float(values["constant"]), values.get("D"))
 
     def _error(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """What W weighs: e = phi(x) - phi(x_ref)."""

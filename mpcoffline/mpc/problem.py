@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
@@ -29,9 +29,11 @@ from .constraints import (
     fitted_constraints,
 )
 from .expression_cost import cost_to_json
-from .expressions import traced
+from .expressions import scalar, traced
+from .layout import Layout
 from .model import Model
 from .parameters import Group, ParameterSpace
+from .seen import stage_expression, terminal_expression
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +47,13 @@ class MPC:
 
     An MPC is immutable; :meth:`with_theta` and :meth:`replace` make new ones.
 
+    Where inputs act with dead time, or their changes have a price, the state x of this problem is z = [y, past inputs],
+    see :class:`~mpcoffline.mpc.layout.Layout` and :meth:`state`; else it is the observation y. Costs and constraints
+    are functions of y all the same; only a cost whose ``nx`` is the size of z gets z.
+
     Args:
-        model: The prediction model f_theta.
+        model: The prediction model f_theta; it gets the inputs of the step before into its state where the stage cost
+            asks for them.
         stage_cost: Lhat_theta, e.g. :class:`QuadraticCost`.
         terminal_cost: T_theta, e.g. :class:`NormCost` or :class:`QuadraticCost`.
         horizon: N, in sampling steps.
@@ -71,6 +78,8 @@ class MPC:
     constraints: Constraints | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        if getattr(self.stage_cost, "uses_previous", False) and min(self.model.layout.carried) < 1:
+            object.__setattr__(self, "model", self.model.with_previous())
         check_integers(1, horizon=self.horizon)
         check_limit("horizon", "steps", self.horizon, limits.HORIZON, error=InvalidArgumentError)
         plan = self.horizon * (self.nx + self.nu)
@@ -85,6 +94,9 @@ class MPC:
         object.__setattr__(self, "action_high", high)
         object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
         _ = self.stage_function, self.terminal_function  # dimensions are refused here, not at the first solve
+        inputs, usual = self._extreme_inputs(), self.layout.usual_signals[self.layout.present - self.layout.n_states]
+        inputs = np.hstack([inputs, np.tile(usual, (len(inputs), 1))])
+        object.__setattr__(self, "model", self.model.suited_to(self._rest()[: self.layout.n_states], inputs))
 
     def _bounds(self, name: str) -> Array:
         bounds = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))
@@ -94,8 +106,18 @@ class MPC:
 
     @property
     def nx(self) -> int:
-        """Number of states."""
+        """Number of states: the size of z."""
         return self.model.nx
+
+    @property
+    def ny(self) -> int:
+        """Size of an observation."""
+        return self.model.ny
+
+    @property
+    def layout(self) -> Layout:
+        """What z is made of."""
+        return self.model.layout
 
     @property
     def nu(self) -> int:
@@ -138,12 +160,61 @@ class MPC:
 
     @property
     def reference(self) -> Array | None:
-        """The state that the stage cost, else the terminal cost, pulls to, ``(nx,)``; None where neither says."""
-        values = self.values
+        """The plant's state that the stage cost, else the terminal cost, pulls to, ``(n_states,)``, or None.
+
+        Where a cost tracks a signal, that is the distance from it.
+        """
+        values, n = self.values, self.layout.n_states
         for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
-            if name in values and values[name].shape == (self.nx,):
-                return values[name]
+            if name in values and values[name].shape in ((n,), (self.ny,), (self.nx,)):
+                return values[name][:n]
         return None
+
+    def _rest(self) -> Array:
+        """The reference; zero where there is none."""
+        return np.zeros(self.layout.n_states) if self.reference is None else self.reference
+
+    def _extreme_inputs(self) -> Array:
+        """The input at rest, and with one input after another on its bounds, ``(1 + 2 nu, nu)``.
+
+        One without bounds is moved by its own size, by 1 where that is zero.
+        """
+        low, high = np.asarray(self.action_low), np.asarray(self.action_high)
+        rest = self.values.get("stage_cost.u_ref", np.zeros(0))
+        with np.errstate(invalid="ignore"):
+            middle = np.nan_to_num((low + high) / 2.0, posinf=0.0, neginf=0.0)
+        rest = np.clip(rest if rest.shape == (self.nu,) else middle, low, high)
+        size = np.where(rest == 0.0, 1.0, np.abs(rest))
+        ends = np.where(np.isfinite(low), low, rest - size), np.where(np.isfinite(high), high, rest + size)
+        moved = [np.where(np.arange(self.nu) == i, end, rest) for end in ends for i in range(self.nu)]
+        return np.stack([rest, *moved])
+
+    @property
+    def usual_input(self) -> Array:
+        """What counts as applied before anything is known, ``(nu,)``: the stage cost's ``u_ref``, else 0, in bounds."""
+        given = self.values.get("stage_cost.u_ref", np.zeros(self.nu))
+        return np.clip(given, np.asarray(self.action_low), np.asarray(self.action_high))
+
+    def state(self, y: ArrayLike, past: ArrayLike | None = None) -> Array:
+        """The states z ``(..., nx)`` of this problem for observations y ``(..., ny)``.
+
+        Args:
+            y: Observations; or the plant's states alone, ``(..., n_states)``, with usual signals.
+            past: The memory ``(..., n_memory)`` in the order of ``layout.names``; :attr:`usual_input` by default.
+
+        Raises:
+            InvalidArgumentError: For another number of coordinates.
+        """
+        observations, layout = np.asarray(y, dtype=np.float64), self.layout
+        memory = layout.filled(self.usual_input) if past is None else np.asarray(past, dtype=np.float64)
+        if layout.signals and observations.shape[-1:] == (layout.n_states,):
+            usual = np.broadcast_to(layout.usual_signals, (*observations.shape[:-1], layout.ny - layout.n_states))
+            observations = np.concatenate([observations, usual], axis=-1)
+        for name, array, size in (("y", observations, layout.ny), ("past", memory, layout.n_memory)):
+            if array.ndim < 1 or array.shape[-1] != size:
+                raise InvalidArgumentError(name, expected=f"shape (..., {size})", actual=f"shape {array.shape}")
+        memory = np.broadcast_to(memory, (*observations.shape[:-1], layout.n_memory))
+        return np.concatenate([observations, memory], axis=-1)
 
     def with_theta(self, theta: ArrayLike) -> MPC:
         """The same problem with other parameters, theta ``(space.size,)``.
@@ -181,23 +252,15 @@ class MPC:
             UnknownIdError: For a name that no parameter has.
             InvalidArgumentError: For a wrong shape, a matrix that is not PSD, or a value out of bounds.
         """
-        n = self.horizon
-        shapes = {block.name: block.shape for block in self.space}
-        along: dict[str, Array] = {}
-        for name, value in values.items():
-            array, shape = np.asarray(value, dtype=np.float64), shapes.get(name, np.shape(value))
-            if array.shape == (n, *shape):
-                array = np.concatenate([array, array[-1:]])
-            elif array.shape == shape:
-                array = np.broadcast_to(array, (n + 1, *shape))
-            if array.shape != (n + 1, *shape):
-                raise InvalidArgumentError(
-                    name, expected=f"shape {shape}, {(n, *shape)} or {(n + 1, *shape)}", actual=f"shape {array.shape}"
-                )
-            along[name] = array
-        return np.stack([self.space.pack({name: array[k] for name, array in along.items()}) for k in range(n + 1)])[
-            None
-        ]
+        return self.space.along(values, self.horizon)[None]
+
+    def with_delay(self, delay: int | Sequence[int] | None) -> Self:
+        """The same problem with another dead time, see :class:`Model`.
+
+        Raises:
+            InvalidArgumentError: For a negative delay, one of another length, or costs of another state than then.
+        """
+        return replace(self, model=self.model.with_delay(delay))
 
     def replace(self, **changes: Any) -> Self:
         """The same problem with other fields, e.g. ``mpc.replace(horizon=20, discount=0.95)``."""
@@ -211,11 +274,21 @@ class MPC:
         return ca.Function("f", [x, u, theta], [reached], ["x", "u", "theta"], ["x_next"])
 
     @cached_property
+    def plant_function(self) -> ca.Function:
+        """The plant's map ``(x, u, theta) -> x_next`` without dead time; ``dynamics_function`` where z is x."""
+        if self.layout.is_plain:
+            return self.dynamics_function
+        layout, theta = self.layout, self._symbols()[2]
+        x, u = ca.SX.sym("x", layout.n_states), ca.SX.sym("u", len(layout.acting))
+        reached = self.model.plant(x, u, self._part("model", theta))
+        return ca.Function("plant", [x, u, theta], [reached], ["x", "u", "theta"], ["x_next"])
+
+    @cached_property
     def stage_function(self) -> ca.Function:
         """Lhat_theta as CasADi function ``(x, u, theta) -> cost``."""
         x, u, theta = self._symbols()
         p = self.stage_cost.space.symbols(self._part("stage_cost", theta))
-        cost = _scalar("stage_cost", lambda: self.stage_cost.expression(x, u, p), self.nx, self.nu)
+        cost = scalar("stage_cost", lambda: stage_expression(self.layout, self.stage_cost, x, u, p), self.ny, self.nu)
         return traced("stage_cost", ca.Function("stage_cost", [x, u, theta], [cost], ["x", "u", "theta"], ["cost"]))
 
     @cached_property
@@ -223,7 +296,9 @@ class MPC:
         """T_theta as CasADi function ``(x, theta) -> cost``."""
         x, _, theta = self._symbols()
         p = self.terminal_cost.space.symbols(self._part("terminal_cost", theta))
-        cost = _scalar("terminal_cost", lambda: self.terminal_cost.terminal_expression(x, p), self.nx, self.nu)
+        cost = scalar(
+            "terminal_cost", lambda: terminal_expression(self.layout, self.terminal_cost, x, p), self.ny, self.nu
+        )
         return traced("terminal_cost", ca.Function("terminal_cost", [x, theta], [cost], ["x", "theta"], ["cost"]))
 
     @cached_property
@@ -242,8 +317,8 @@ class MPC:
 
     @property
     def state_bounds(self) -> list[StateBounds]:
-        """The bounds of x_1 ... x_N."""
-        return [c for c in self._constraints if isinstance(c, StateBounds)]
+        """The bounds of x_1 ... x_N, on z; past inputs have none."""
+        return [c.padded(self.nx - self.ny) for c in self._constraints if isinstance(c, StateBounds)]
 
     @property
     def _constraints(self) -> tuple[Constraint | StateBounds, ...]:
@@ -251,7 +326,8 @@ class MPC:
 
     def constraint_expression(self, constraint: Constraint) -> Callable[..., ca.SX]:
         """One of the constraints as ``(x, u, theta) -> h``, or ``(x, theta) -> h`` at the end."""
-        return lambda *arguments: constraint.function(*arguments[:-1], self._part("model", arguments[-1]))
+        ny = self.ny
+        return lambda x, *others: constraint.function(x[:ny], *others[:-1], self._part("model", others[-1]))
 
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         size = sum(component.space.size for component in self._components().values())
@@ -272,8 +348,8 @@ class MPC:
         """
         return {
             "model": self.model.to_json(),
-            "stage_cost": cost_to_json(self.stage_cost, self.nx, self.nu, portable=portable),
-            "terminal_cost": cost_to_json(self.terminal_cost, self.nx, portable=portable),
+            "stage_cost": cost_to_json(self.stage_cost, self.layout, stage=True, portable=portable),
+            "terminal_cost": cost_to_json(self.terminal_cost, self.layout, stage=False, portable=portable),
             "horizon": self.horizon,
             "discount": self.discount,
             "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],
@@ -307,7 +383,7 @@ class MPC:
 
 
 def _sizes(model: Model) -> Sizes:
-    return Sizes(model.nx, model.nu, model.space)
+    return Sizes(model.ny, model.nu, model.space)
 
 
 def _discount(value: object) -> float:
@@ -318,16 +394,3 @@ def _discount(value: object) -> float:
 
 def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def _scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.SX:
-    """Evaluates a cost expression, turning CasADi's dimension errors into one that says what is expected."""
-    try:
-        cost = ca.densify(ca.SX(expression()))
-    except (InvalidArgumentError, RuntimeError) as error:
-        raise InvalidArgumentError(
-            name, expected=f"a cost for nx = {nx}, nu = {nu}", actual=str(error).splitlines()[-1]
-        ) from error
-    if cost.shape != (1, 1):
-        raise InvalidArgumentError(name, expected="a scalar", actual=f"shape {cost.shape}")
-    return cost

@@ -59,6 +59,7 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
             dt=plant.dt,
             parameters=_parameters(plant, alpha, seed),
             discrete=plant.discrete,
+            integrator="auto" if plant.discrete else "rk4",  # the plant's own step
         ),
         stage_cost=QuadraticCost(
             np.diag(cost.weights), np.diag(cost.input_weights), x_ref=target, u_ref=cost.input_target

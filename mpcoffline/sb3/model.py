@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from mpcoffline.control.course import Course
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers, checked_seed
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
@@ -116,7 +117,7 @@ class MPCModel(BaseAlgorithm):
         state: tuple[NDArray[Any], ...] | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[Any], Plan]:
+    ) -> tuple[NDArray[Any], Plan | Course]:
         """Actions and the warm start of the next call, see :meth:`MPCPolicy.predict`."""
         return self.policy.predict(observation, state, episode_start, deterministic)
 

@@ -10,7 +10,8 @@ import torch
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import Identification, OneStepProblem, Rows, without_jumps
+from mpcoffline.estimation.identification import OneStepIdentification, OneStepProblem, Rows, without_jumps
+from mpcoffline.estimation.plant import plant_rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
@@ -25,7 +26,7 @@ _WEAKEST_PRIOR = 1e-8
 
 
 class _Residual(NamedTuple):
-    """What a member adds to the model: a function of (s, a) that explains a part of what the model misses."""
+    """What a member adds to the model: a function of (x, u) that explains a part of what the model misses."""
 
     features: RandomFeatures
     regression: Ridge
@@ -45,7 +46,7 @@ class Ensemble:
 
     Args:
         mpc: The MPC whose model it is.
-        table: The transitions; smoothed, where they were noisy.
+        table: The transitions of its states, past inputs included; smoothed, where they were noisy.
         identification: The identified model.
         n_perturbed: See above.
         n_residual: See above.
@@ -56,13 +57,14 @@ class Ensemble:
         self,
         mpc: MPC,
         table: TransitionTable,
-        identification: Identification,
+        identification: OneStepIdentification,
         *,
         n_perturbed: int = 5,
         n_residual: int = 5,
         seed: int = 0,
     ) -> None:
-        self._twin = TorchTwin(mpc.dynamics_function)
+        self._twin, self._layout = TorchTwin(mpc.plant_function), mpc.layout
+        table = plant_rows(mpc, table)
         rng = np.random.default_rng(seed)
         problem = _problem_of(mpc.with_theta(identification.theta), table, identification)
         episodes = _Episodes(table)
@@ -84,13 +86,14 @@ class Ensemble:
 
     def step(self, x: Array, u: Array) -> Array:
         """The successors of states ``(members, starts, nx)`` under inputs ``(members, starts, nu)``, each its own."""
+        states, acting = self._layout.split(x, u)
         with torch.no_grad():
             theta = torch.from_numpy(self.thetas[:, None])
-            reached: Array = self._twin(*(torch.from_numpy(np.array(v)) for v in (x, u)), theta).numpy()
+            reached: Array = self._twin(*(torch.from_numpy(np.array(v)) for v in (states, acting)), theta).numpy()
         for i, residual in enumerate(self._residuals):
             if residual is not None:
-                reached[i] += residual(x[i], u[i])
-        return reached
+                reached[i] += residual(states[i], acting[i])
+        return self._layout.joined(reached, x, u)
 
 
 class _Episodes:
@@ -111,7 +114,7 @@ class _Episodes:
         return Rows(*(part[chosen] for part in rows))
 
 
-def _problem_of(mpc: MPC, table: TransitionTable, identification: Identification) -> OneStepProblem:
+def _problem_of(mpc: MPC, table: TransitionTable, identification: OneStepIdentification) -> OneStepProblem:
     """One-step prediction on the whole table, wrapped angles without jumps."""
     columns = table.values()
     rows = Rows(columns.observations, columns.actions, columns.next_observations)

@@ -66,7 +66,7 @@ def _episode(plant: Plant, discount: float) -> MPC:
 
     state_weights, input_weights, rest = _weights(plant)
     return MPC(
-        model=Model(ode, nx, nu, plant.dt),
+        model=Model(ode, nx, nu, plant.dt, integrator="rk4"),  # the plant's own step
         stage_cost=LiftedCost(wrapped, np.zeros(nx), state_weights, input_weights, u_ref=rest),
         terminal_cost=QuadraticCost(np.zeros((nx, nx))),
         horizon=EPISODE_STEPS,

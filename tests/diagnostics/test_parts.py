@@ -23,7 +23,7 @@ from mpcoffline.diagnostics.measures import (
 )
 from mpcoffline.diagnostics.stability import closed_loop_eigenvalues, value_growth, weight_checks
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.estimation.identification import identify
+from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.simulation.closed_loop import initial_states, simulate
 from mpcoffline.simulation.ensemble import Ensemble
@@ -56,7 +56,21 @@ def test_a_quadratic_cost_is_found_exactly() -> None:
     x, u = np.array([[3.0, -2.0]]), np.array([[1.5]])  # far outside the data
     expected = lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)
     np.testing.assert_allclose(cost(x, u), expected, rtol=1e-3)
-    assert cost(np.zeros((1, 2)), np.zeros((1, 1))) >= cost.low == LOG.costs.min()
+    assert cost(np.zeros((1, 2)), np.zeros((1, 1))) == pytest.approx(0.0, abs=1e-4)  # cheaper than anything logged
+    assert cost.low == LOG.costs.min() > 0.0
+
+
+def test_the_cost_of_the_mpc_is_used_where_it_is_the_logged_one() -> None:
+    """Of any sign, beyond all data, and where the states are noisy."""
+    s, a = (v.astype(np.float64) for v in (LOG.observations, LOG.actions))
+    noisy = s + 0.02 * np.random.default_rng(0).normal(size=s.shape)
+    costs = 2.0 * LOG.costs - 5e3
+    table = TransitionTable.from_arrays(noisy, a, costs, LOG.next_observations, LOG.terminations, LOG.episode_ids)
+    cost = LoggedCost(table, mpc=lq_plant.make_mpc())
+    assert cost.exact
+    x, u = np.array([[3.0, -2.0], [0.0, 0.0]]), np.array([[1.5], [0.0]])
+    expected = 2.0 * (lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)) - 5e3
+    np.testing.assert_allclose(cost(x, u), expected, atol=0.1)
 
 
 def test_another_cost_is_learned_with_random_features() -> None:
@@ -82,7 +96,7 @@ def test_a_constant_cost_is_learned() -> None:
 
 def test_the_first_member_is_the_identified_model_and_the_others_are_near() -> None:
     mpc = lq_plant.make_mpc()
-    ensemble = Ensemble(mpc, LOG, identify(mpc, LOG), seed=0)
+    ensemble = Ensemble(mpc, LOG, identify_one_step(mpc, LOG), seed=0)
     rng = np.random.default_rng(1)
     x, u = rng.uniform(-1, 1, (7, 2)), rng.uniform(-1, 1, (7, 1))
     reached = ensemble.step(np.broadcast_to(x, (11, 7, 2)), np.broadcast_to(u, (11, 7, 1)))
@@ -92,13 +106,13 @@ def test_the_first_member_is_the_identified_model_and_the_others_are_near() -> N
     distances = np.abs(reached - expected).max(axis=(1, 2))
     assert (distances[1:6] > 1e-4).all()  # perturbed, though the data leave no doubt
     assert (distances < 0.1).all()
-    again = Ensemble(mpc, LOG, identify(mpc, LOG), seed=0)
+    again = Ensemble(mpc, LOG, identify_one_step(mpc, LOG), seed=0)
     np.testing.assert_array_equal(again.thetas, ensemble.thetas)
 
 
 def test_residual_members_know_what_the_structure_misses() -> None:
     mpc, log = lq_plant.make_mpc(), episodes(n=60, friction=0.1)
-    ensemble = Ensemble(mpc, log, identify(mpc, log))
+    ensemble = Ensemble(mpc, log, identify_one_step(mpc, log))
     test = episodes(n=20, friction=0.1, seed=9)
     s, a, reached = (v.astype(np.float64) for v in (test.observations, test.actions, test.next_observations))
     predicted = ensemble.step(np.broadcast_to(s, (11, *s.shape)), np.broadcast_to(a, (11, *a.shape)))
@@ -107,7 +121,7 @@ def test_residual_members_know_what_the_structure_misses() -> None:
 
 
 def test_a_simulation_is_the_closed_loop_of_the_optimal_gain() -> None:
-    ensemble = Ensemble(TRUE_MPC, LOG, identify(TRUE_MPC, LOG), n_perturbed=0, n_residual=0)
+    ensemble = Ensemble(TRUE_MPC, LOG, identify_one_step(TRUE_MPC, LOG), n_perturbed=0, n_residual=0)
     starts = initial_states(LOG, 5, 0)
     cost = LoggedCost(LOG)
     result = simulate(MPCPolicy(TRUE_MPC), ensemble, cost, LOG, starts, 40)
@@ -124,7 +138,7 @@ def test_a_simulation_is_the_closed_loop_of_the_optimal_gain() -> None:
 
 def test_a_state_that_runs_away_is_lost_and_dear() -> None:
     unstable = lq_plant.make_mpc((3.0 * np.eye(2), np.zeros((2, 1))))
-    known = identify(unstable, LOG)
+    known = identify_one_step(unstable, LOG)
     ensemble = Ensemble(
         unstable, LOG, type(known)(unstable.theta, *list(vars(known).values())[1:]), n_perturbed=0, n_residual=0
     )
@@ -197,7 +211,7 @@ def test_states_far_from_the_data_are_outside_their_support() -> None:
 def test_a_late_input_is_found_and_a_wrong_structure_is_not_taken_for_one() -> None:
     for log, found in ((episodes(lag=1), True), (episodes(friction=0.1), False), (LOG, False)):
         mpc = lq_plant.make_mpc()
-        known = mpc.with_theta(identify(mpc, log).theta)
+        known = mpc.with_theta(identify_one_step(mpc, log).theta)
         assert lag_check(known, log).found == found
     assert not lag_check(TRUE_MPC, episodes(n=2, steps=5)).found
 

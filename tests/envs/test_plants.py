@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mpcoffline import nominal_mpc
 from mpcoffline.datasets.recipes import Recipe
 from mpcoffline.envs import PLANTS, ControlTask, Parameter, Plant, State, find_plant, register
+from mpcoffline.envs.page import page
 from mpcoffline.envs.pendulum_swing_up import PLANT, PendulumSwingUpEnv
 
 Array = NDArray[np.float64]
@@ -45,6 +46,30 @@ def random_cases(plant: Plant, n: int = 200, speed: float = 2.0) -> tuple[Array,
 def lifted(plant: Plant, states: Array) -> Array:
     """The observation in float64."""
     return np.stack(plant.lift(states.T, np.cos, np.sin), axis=-1)
+
+
+def test_a_page_comes_from_the_description() -> None:
+    written = """Falls.
+
+## Description
+Mine.
+
+## Rewards
+None.
+
+## State Space
+Own words.
+
+## References
+None."""
+    made = page(replace(PLANT, starts={"mine": lambda rng: np.zeros(2)}), written)
+    assert made.startswith("Falls.\n\n## Description\nMine.\n\n## Action Space\n`Box(-2.0, 2.0, (1,), float32)`")
+    assert r"| 0   | torque $u$ | $-2$ | $2$ | N m  |" in made
+    assert r"| 2   | $\dot\varphi$ | $-200$ | $200$ | rad/s |" in made
+    assert "## State Space\nOwn words.\n\n## Rewards" in made
+    assert '| `"mine"` (default) | its own   | its own' in made
+    assert "| `l`                 | float            | 1.0      | length, 0.05 to 20 m " in made
+    assert r'| `"hanging"`         | $\pi + U(-0.2, 0.2)$ | $U(-0.1, 0.1)$ |' in page(PLANT, written)
 
 
 @every_plant

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import mpcoffline
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.estimation.identification import IdentificationConfig, identify
+from mpcoffline.estimation.identification import IdentificationConfig, identify_one_step
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.plants.nominal import nominal_mpc
 
@@ -48,7 +48,9 @@ def test_a_linear_model_is_numpys_least_squares() -> None:
     x, u = inputs(400, 2, 1)
     reached = x @ TRUE_A.T + u @ TRUE_B.T + 0.05 * np.random.default_rng(1).normal(size=x.shape)
     table = table_of(x, u, reached)
-    result = identify(linear_mpc(np.eye(2), np.full((2, 1), 0.5)), table, IdentificationConfig(prior_spread=1e3))
+    result = identify_one_step(
+        linear_mpc(np.eye(2), np.full((2, 1), 0.5)), table, IdentificationConfig(prior_spread=1e3)
+    )
     regressors = np.hstack([table.observations, table.actions]).astype(np.float64)
     expected, *_ = np.linalg.lstsq(regressors, table.next_observations.astype(np.float64), rcond=None)
     np.testing.assert_allclose(result.theta[:4].reshape(2, 2), expected[:2].T, atol=1e-6)
@@ -58,7 +60,7 @@ def test_a_linear_model_is_numpys_least_squares() -> None:
 def test_deviations_are_those_of_the_linear_regression() -> None:
     x, u = inputs(4_000, 1, 1)
     reached = 0.9 * x + 0.3 * u + 0.05 * np.random.default_rng(1).normal(size=x.shape)
-    result = identify(linear_mpc([[1.0]], [[0.5]]), table_of(x, u, reached))
+    result = identify_one_step(linear_mpc([[1.0]], [[0.5]]), table_of(x, u, reached))
     covariance = 0.05**2 * np.linalg.inv(np.hstack([x, u]).T @ np.hstack([x, u]))
     np.testing.assert_allclose(result.deviation[:2], np.sqrt(np.diag(covariance)), rtol=0.05)
 
@@ -70,7 +72,7 @@ def test_the_swing_ups_parameters_are_found_from_far_away(task: str, env_id: str
     env_id = f"mpcoffline/{env_id}-v0"
     table = TransitionTable.from_minari(f"mpcoffline/{task}/ddpg-v0")
     mpc = nominal_mpc(env_id, alpha=1.5, seed=seed)
-    result = identify(mpc, table, IdentificationConfig(rows=3_000))
+    result = identify_one_step(mpc, table, IdentificationConfig(rows=3_000))
     model = mpc.space.mask(("model",))
     np.testing.assert_allclose(result.theta[model], nominal_mpc(env_id).theta[model], rtol=1e-3)
     np.testing.assert_array_equal(result.theta[~model], mpc.theta[~model])
@@ -82,7 +84,7 @@ def test_the_swing_ups_parameters_are_found_from_far_away(task: str, env_id: str
 def test_errors_are_prediction_errors_in_spreads_of_the_increments() -> None:
     x, u = inputs(50, 2, 1)
     table = table_of(x, u, x @ TRUE_A.T + u @ TRUE_B.T + np.array([0.3, 0.0]))
-    result = identify(linear_mpc(np.eye(2), np.zeros((2, 1))), table)
+    result = identify_one_step(linear_mpc(np.eye(2), np.zeros((2, 1))), table)
     s, reached = table.observations.astype(np.float64), table.next_observations.astype(np.float64)
     spread = (reached - s).std(axis=0)
     np.testing.assert_allclose(result.scale, spread, rtol=1e-6)
@@ -111,7 +113,8 @@ def test_what_the_data_do_not_determine_is_named_and_stays_near_the_guess(caplog
     true = mpc.with_theta(mpc.space.pack({"model.mass": 1.0, "model.gear": 1.5, "model.friction": 0.2}))
     x, u = inputs(500, 2, 1)
     with caplog.at_level(logging.WARNING):
-        result = identify(mpc, table_of(x, u, true.model(x, u)))
+        result = identify_one_step(mpc, table_of(x, u, true.model(x, u)))
+        result.warn()
     mass, gear, friction, unused = result.theta[:4]
     assert (gear / mass, friction / mass) == pytest.approx((1.5, 0.2), rel=1e-4)
     assert unused == pytest.approx(7.0)
@@ -127,7 +130,7 @@ def test_what_the_data_do_not_determine_is_named_and_stays_near_the_guess(caplog
 def test_data_without_excitation_change_nothing() -> None:
     x, u = np.zeros((40, 2)), np.zeros((40, 1))
     mpc = mpc_of(Model(cart, 2, 1, 0.1, CART))
-    result = identify(mpc, table_of(x, u, x))
+    result = identify_one_step(mpc, table_of(x, u, x))
     np.testing.assert_allclose(result.theta, mpc.theta)
     assert len(result.undetermined) == 4
 
@@ -136,7 +139,8 @@ def test_a_bound_that_binds_is_named(caplog: pytest.LogCaptureFixture) -> None:
     x, u = inputs(300, 1, 1)
     mpc = linear_mpc([[0.2]], [[0.3]], low=0.0, high=0.5)
     with caplog.at_level(logging.WARNING):
-        result = identify(mpc, table_of(x, u, 0.9 * x + 0.3 * u))
+        result = identify_one_step(mpc, table_of(x, u, 0.9 * x + 0.3 * u))
+        result.warn()
     assert result.at_bound == ("model.A[0,0]",)
     assert result.theta[0] == pytest.approx(0.5, abs=1e-3)
     assert "model.A[0,0]" in caplog.text
@@ -145,14 +149,14 @@ def test_a_bound_that_binds_is_named(caplog: pytest.LogCaptureFixture) -> None:
 def test_a_parameter_without_freedom_stays() -> None:
     x, u = inputs(300, 1, 1)
     mpc = linear_mpc([[0.2]], [[0.1]], low=0.2, high=0.2)
-    result = identify(mpc, table_of(x, u, 0.2 * x + 0.3 * u))
+    result = identify_one_step(mpc, table_of(x, u, 0.2 * x + 0.3 * u))
     np.testing.assert_allclose(result.theta[:2], [0.2, 0.3], rtol=1e-5)
 
 
 def test_a_model_without_parameters_is_returned_as_it_is() -> None:
     mpc = mpc_of(Model(lambda x, u, p: 0.9 * x + u, 1, 1, 0.1, discrete=True))
     x, u = inputs(20, 1, 1)
-    result = identify(mpc, table_of(x, u, x))
+    result = identify_one_step(mpc, table_of(x, u, x))
     np.testing.assert_array_equal(result.theta, mpc.theta)
     assert result.error_before == result.error_after > 0.0
 
@@ -173,14 +177,14 @@ def test_wrapped_angles_are_compared_modulo_full_turns() -> None:
     reached = true.model(x, u)
     reached[:, 0] = (reached[:, 0] + np.pi) % (2 * np.pi) - np.pi
     assert (np.abs(reached[:, 0] - x[:, 0]) > 5.0).sum() > 10  # some do wrap
-    result = identify(mpc, table_of(x, u, reached))
+    result = identify_one_step(mpc, table_of(x, u, reached))
     assert result.unwrapped == (0,)
     np.testing.assert_allclose(result.theta[:2], [14.7, 3.0], rtol=1e-4)
 
 
 def test_large_errors_alone_are_no_wrapped_angles() -> None:
     x, u = inputs(400, 1, 1)
-    result = identify(linear_mpc([[1.0]], [[0.0]]), table_of(30.0 * x, u, 15.0 * x + u))
+    result = identify_one_step(linear_mpc([[1.0]], [[0.0]]), table_of(30.0 * x, u, 15.0 * x + u))
     assert result.unwrapped == ()
     assert result.theta[0] == pytest.approx(0.5, abs=1e-3)
 
@@ -188,7 +192,7 @@ def test_large_errors_alone_are_no_wrapped_angles() -> None:
 def test_a_start_at_which_the_model_is_not_finite_is_left_behind() -> None:
     mpc = mpc_of(Model(lambda x, u, p: x * ca.sqrt(p["a"]) + u, 1, 1, 0.1, {"a": -0.3}, discrete=True))
     x, u = inputs(300, 1, 1)
-    result = identify(mpc, table_of(x, u, 0.8 * x + u), IdentificationConfig(restarts=20, prior_spread=5.0))
+    result = identify_one_step(mpc, table_of(x, u, 0.8 * x + u), IdentificationConfig(restarts=20, prior_spread=5.0))
     assert result.theta[0] == pytest.approx(0.64, abs=1e-3)
     assert np.isfinite(result.errors_before).all()
 
@@ -199,8 +203,8 @@ def test_units_do_not_matter(log_x: float, log_u: float, seed: int) -> None:
     unit_x, unit_u = 10.0**log_x, 10.0**log_u
     x, u = inputs(100, 1, 1, seed)
     reached = 0.9 * x + 0.3 * u + 0.01 * np.random.default_rng(seed + 1000).normal(size=x.shape)
-    plain = identify(linear_mpc([[0.5]], [[0.2]]), table_of(x, u, reached))
-    scaled = identify(
+    plain = identify_one_step(linear_mpc([[0.5]], [[0.2]]), table_of(x, u, reached))
+    scaled = identify_one_step(
         linear_mpc([[0.5]], [[0.2 * unit_x / unit_u]]), table_of(unit_x * x, unit_u * u, unit_x * reached)
     )
     np.testing.assert_allclose(scaled.theta[:2] * [1.0, unit_u / unit_x], plain.theta[:2], rtol=1e-4, atol=1e-5)
@@ -212,7 +216,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     table = TransitionTable.from_minari("mpcoffline/pendulum/ddpg-v0")
     mpc = nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=3)
     config = IdentificationConfig(rows=500)
-    first, again, other = (identify(mpc, table, config, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (identify_one_step(mpc, table, config, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.theta, again.theta)
     assert (first.theta != other.theta).any()
 
@@ -226,4 +230,4 @@ def test_a_configuration_out_of_range_is_refused(bad: dict[str, Any]) -> None:
 def test_data_of_another_plant_are_refused() -> None:
     x, u = inputs(10, 2, 1)
     with pytest.raises(InvalidDataError, match="observations"):
-        identify(mpcoffline.nominal_mpc("mpcoffline/PendulumSwingUp-v0"), table_of(x, u, x))
+        identify_one_step(mpcoffline.nominal_mpc("mpcoffline/PendulumSwingUp-v0"), table_of(x, u, x))

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.table.cache import scratch_table
-from mpcoffline.estimation import smoothing
-from mpcoffline.estimation.identification import identify
+from mpcoffline.estimation import identify, smoothing
+from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.estimation.smoothing import (
     NoiseEstimate,
     estimate_noise,
-    identify_smoothed,
     smooth,
     with_measurement_noise,
 )
@@ -128,7 +127,7 @@ def test_rows_without_neighbours_say_nothing() -> None:
     lone = TransitionTable(CLEAN.rows, CLEAN.ny, CLEAN.nu, np.arange(len(CLEAN)))
     noisy = with_measurement_noise(lone, 0.05, 0)
     assert estimate_noise(GUESS, noisy).source == "unknown"
-    result = identify_smoothed(GUESS, noisy)
+    result = identify(GUESS, noisy)
     assert result.table is noisy
 
 
@@ -138,12 +137,12 @@ def test_rows_without_neighbours_say_nothing() -> None:
 @pytest.mark.parametrize("source", ["repeated", "innovations"])
 def test_parameters_and_states_are_recovered(source: str) -> None:
     noisy = NOISY[source]
-    result = identify_smoothed(GUESS, noisy)
-    np.testing.assert_allclose(result.identification.theta[:2], TRUE, rtol=0.01)
+    result = identify(GUESS, noisy)
+    np.testing.assert_allclose(result.theta[:2], TRUE, rtol=0.01)
     assert distance(result.table, CLEAN) < 0.2 * distance(noisy, CLEAN)
-    errors = np.abs(result.identification.theta[:2] - TRUE)
-    assert (errors < 4.0 * result.identification.deviation[:2]).all()
-    assert (result.identification.deviation[:2] < 0.01).all()
+    errors = np.abs(result.theta[:2] - TRUE)
+    assert (errors < 4.0 * result.deviation[:2]).all()
+    assert (result.deviation[:2] < 0.01).all()
     radius = np.linalg.norm(result.table.observations[:, :2], axis=1)
     assert np.abs(radius - 1.0).max() < 0.05
     np.testing.assert_array_equal(result.table.actions, noisy.actions)
@@ -152,22 +151,22 @@ def test_parameters_and_states_are_recovered(source: str) -> None:
 
 def test_one_step_least_squares_is_biased_and_the_filter_is_not() -> None:
     noisy = with_measurement_noise(CLEAN, 0.1, 0)
-    one_step = np.abs(identify(GUESS, noisy).theta[:2] / TRUE - 1.0).max()
-    filtered = np.abs(identify_smoothed(GUESS, noisy).identification.theta[:2] / TRUE - 1.0).max()
+    one_step = np.abs(identify_one_step(GUESS, noisy).theta[:2] / TRUE - 1.0).max()
+    filtered = np.abs(identify(GUESS, noisy).theta[:2] / TRUE - 1.0).max()
     assert filtered < 0.3 * one_step
 
 
 def test_clean_data_are_left_alone() -> None:
-    for table in (CLEAN, with_measurement_noise(CLEAN, 0.005, 0)):
-        result = identify_smoothed(GUESS, table)
+    for table in (CLEAN, with_measurement_noise(CLEAN, 0.002, 0)):
+        result = identify(GUESS, table)
         assert result.table is table
-        np.testing.assert_array_equal(result.identification.theta, identify(GUESS, table).theta)
+        np.testing.assert_array_equal(result.theta, identify_one_step(GUESS, table).theta)
 
 
 def test_with_a_wrong_structure_the_data_are_believed() -> None:
     damped = episodes(pendulum(friction=1.5).model)
     noisy = with_measurement_noise(damped, 0.05, 0)
-    result = identify_smoothed(pendulum(0.6), noisy)  # which knows no friction
+    result = identify(pendulum(0.6), noisy)  # which knows no friction
     assert distance(result.table, damped) < 0.8 * distance(noisy, damped)
 
 
@@ -177,8 +176,8 @@ def test_rows_left_out_are_gaps() -> None:
     trimmed, truth = (TransitionTable(t.rows[keep], t.ny, t.nu, t.episode_ids[keep]) for t in (noisy, CLEAN))
     noise = estimate_noise(GUESS, trimmed)
     np.testing.assert_allclose(noise.levels, 0.05, rtol=0.15)
-    result = identify_smoothed(GUESS, trimmed)
-    np.testing.assert_allclose(result.identification.theta[:2], TRUE, rtol=0.02)
+    result = identify(GUESS, trimmed)
+    np.testing.assert_allclose(result.theta[:2], TRUE, rtol=0.02)
     assert distance(result.table, truth) < 0.4 * distance(trimmed, truth)
 
 
@@ -189,9 +188,9 @@ def test_wrapped_angles_are_smoothed_across_the_jump() -> None:
         rows[:, column] = (rows[:, column] + np.pi) % (2 * np.pi) - np.pi
     wrapped = TransitionTable(rows, clean.ny, clean.nu, clean.episode_ids)
     noisy = with_measurement_noise(wrapped, 0.03, 0)
-    result = identify_smoothed(pendulum(0.7), noisy)
-    np.testing.assert_allclose(result.identification.theta[:2], [14.7, 3.0], rtol=0.02)
-    assert result.identification.unwrapped == (0,)
+    result = identify(pendulum(0.7), noisy)
+    np.testing.assert_allclose(result.theta[:2], [14.7, 3.0], rtol=0.02)
+    assert result.unwrapped == (0,)
     turned = (result.table.observations[:, 0] - clean.observations[:, 0] + np.pi) % (2 * np.pi) - np.pi
     noise = 0.03 * wrapped.observations[:, 0].std()
     assert np.sqrt(np.mean(turned**2)) < 0.5 * noise
@@ -207,9 +206,9 @@ def test_a_model_without_parameters_smooths_too() -> None:
         [-2.0],
         [2.0],
     )
-    result = identify_smoothed(fixed, NOISY["repeated"])
+    result = identify(fixed, NOISY["repeated"])
     assert distance(result.table, CLEAN) < 0.01
-    np.testing.assert_array_equal(result.identification.theta, fixed.theta)
+    np.testing.assert_array_equal(result.theta, fixed.theta)
 
 
 def test_smoothing_with_known_model_and_noise() -> None:
@@ -236,7 +235,7 @@ def test_a_table_larger_than_memory_gives_one_that_is(tmp_path: Path, monkeypatc
 
 def test_a_long_trajectory_is_smoothed_in_pieces() -> None:
     clean = episodes(PENDULUM.model, n=1, steps=450)
-    result = identify_smoothed(GUESS, with_measurement_noise(clean, 0.05, 1))
+    result = identify(GUESS, with_measurement_noise(clean, 0.05, 1))
     assert distance(result.table, clean) < 0.02
 
 
@@ -244,8 +243,8 @@ def test_a_long_trajectory_is_smoothed_in_pieces() -> None:
 def test_a_large_table_is_identified_from_stretches_and_smoothed_in_chunks() -> None:
     clean = episodes(PENDULUM.model, n=1_100, steps=100)
     noisy = with_measurement_noise(clean, 0.05, 1)
-    result = identify_smoothed(GUESS, noisy)
-    np.testing.assert_allclose(result.identification.theta[:2], TRUE, rtol=0.01)
+    result = identify(GUESS, noisy)
+    np.testing.assert_allclose(result.theta[:2], TRUE, rtol=0.01)
     assert distance(result.table, clean) < 0.007
     spread = clean.observations.std(axis=0)
     worst = np.abs((result.table.observations - clean.observations) / spread).max()

@@ -10,8 +10,8 @@ import pytest
 
 from mpcoffline import OfflineMPCLearner, TransitionTable, nominal_mpc
 from mpcoffline.core.errors import InvalidDataError
-from mpcoffline.estimation.identification import identify
-from mpcoffline.learning.bellman.equation import variance_of
+from mpcoffline.estimation.identification import identify_one_step
+from mpcoffline.mpc.scaling import cost_spread
 
 QUICK: dict[str, Any] = {
     "value_n_steps": 50,
@@ -45,7 +45,7 @@ def test_constant_data_give_a_constant_terminal_cost(
 ) -> None:
     learner = fitted(table(state, cost))
     assert np.isfinite(learner.theta).all()
-    assert f"all costs are {cost:g}, so they do not tell what is good" in caplog.text
+    assert f"the logged cost is {cost:g} in every transition" in caplog.text
 
 
 @pytest.mark.parametrize("cost", [1e-30, 1.0, float(np.finfo(np.float32).max)])
@@ -53,13 +53,13 @@ def test_the_error_of_a_constant_cost_is_in_its_own_unit(cost: float) -> None:
     learner = fitted(table(cost=cost), "paper")
     assert learner.result is not None
     assert learner.result.loss_after < 10.0
-    assert variance_of(np.full(7, np.float32(cost))) == pytest.approx(float(np.float32(cost)) ** 2, rel=1e-6)
+    assert cost_spread(np.full(7, np.float32(cost))) == pytest.approx(float(np.float32(cost)), rel=1e-6)
 
 
-def test_the_unit_of_other_costs_is_their_variance() -> None:
+def test_the_unit_of_other_costs_is_their_spread() -> None:
     costs = np.random.default_rng(0).uniform(size=50)
-    assert variance_of(costs) == costs.var()
-    assert variance_of(np.zeros(3)) == 1.0
+    assert cost_spread(costs) == costs.std()
+    assert cost_spread(np.zeros(3)) == 1.0
 
 
 def test_what_overflows_is_called_that() -> None:
@@ -68,4 +68,4 @@ def test_what_overflows_is_called_that() -> None:
     a, costs = rng.uniform(-2.0, 2.0, (N, 1)), rng.uniform(size=N)
     data = TransitionTable.from_arrays(s[:-1], a, costs, s[1:], np.zeros(N))
     with pytest.raises(InvalidDataError, match=r"identification: .*states up to .*e\+30 .* units"):
-        identify(nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0), data)
+        identify_one_step(nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.0, seed=0), data)

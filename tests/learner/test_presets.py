@@ -59,16 +59,36 @@ def test_an_option_has_one_spelling_and_each_comes_back(name: str) -> None:
     [("default", 0.9, 0.95), ("default", 0.97, 0.97), ("fast", 0.9, 0.95), ("best", 0.95, 0.97), ("best", 0.99, 0.99)],
 )
 def test_the_other_presets_have_a_least_discount(preset: str, given: float, discount: float) -> None:
-    mpc = make_mpc().replace(discount=given)
+    mpc = nominal_mpc(PENDULUM).replace(discount=given)
     assert PRESETS[preset].restructured(mpc).discount == discount
     assert PRESETS[preset].replaced({"discount": 0.8}).restructured(mpc).discount == 0.8
     assert mpc.discount == given
+
+
+@pytest.mark.parametrize("preset", ["default", "fast", "best"])
+def test_a_linear_quadratic_mpc_keeps_its_discount(preset: str) -> None:
+    assert PRESETS[preset].restructured(make_mpc()).discount == make_mpc().discount == 0.9
+    limited = make_mpc().replace(constraints=lambda x, u, p: x[0] - 1.0)
+    assert PRESETS[preset].restructured(limited).discount > 0.9
 
 
 def test_horizons_are_those_of_the_preset() -> None:
     horizons = {name: method.restructured(nominal_mpc(PENDULUM)).horizon for name, method in PRESETS.items()}
     assert horizons["paper"] == 50
     assert horizons["fast"] <= 10 < horizons["default"] <= horizons["best"]
+
+
+@pytest.mark.parametrize(
+    ("discount", "given", "horizon"),
+    # .95^30 = .2146; .995^307 = .2146, .97^51 = .2115, .97^50 = .2181
+    [(0.95, 100, 30), (0.9, 200, 30), (0.97, 20, 30), (0.97, 40, 40), (0.97, 200, 51), (0.995, 200, 200)],
+)
+def test_a_horizon_is_shortened_as_far_as_the_discount_allows(discount: float, given: int, horizon: int) -> None:
+    """The terminal cost weighs no more than in the study, whatever the sampling time."""
+    mpc = make_mpc().replace(discount=discount, horizon=given)
+    assert PRESETS["default"].restructured(mpc).horizon == horizon
+    assert PRESETS["default"].replaced({"horizon": 7}).restructured(mpc).horizon == 7
+    assert PRESETS["paper"].restructured(mpc).horizon == given
 
 
 def test_a_cross_term_leaves_the_cost_as_it_is_until_it_is_fitted() -> None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mpcoffline import MPC, Model, OfflineMPCLearner, Parameter, QuadraticCost
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.diagnostics.measures import one_step_error, outside_support
-from mpcoffline.estimation.identification import identify
-from mpcoffline.estimation.smoothing import estimate_noise, identify_smoothed, with_measurement_noise
+from mpcoffline.estimation import estimate_noise, identify, with_measurement_noise
+from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.learning import ValueFunction
 from mpcoffline.learning.terminal import fit_terminal, terminal_error
 from mpcoffline.learning.value.noise import estimate_stochasticity
@@ -99,8 +99,8 @@ def test_theta_does_not_depend_on_the_offset(preset: str, options: dict[str, Any
 
 
 def test_the_model_is_identified_to_float64() -> None:
-    found = identify(mpc(FAR), FAR_LOG)
-    np.testing.assert_allclose(found.scale, identify(mpc(0.0), NEAR_LOG).scale, rtol=1e-5)
+    found = identify_one_step(mpc(FAR), FAR_LOG)
+    np.testing.assert_allclose(found.scale, identify_one_step(mpc(0.0), NEAR_LOG).scale, rtol=1e-5)
     assert found.error_after < 1e-6
     np.testing.assert_allclose(mpc(FAR).with_theta(found.theta).values["model.a"], 0.9, rtol=1e-6)
     assert one_step_error(mpc(FAR).with_theta(found.theta), FAR_LOG) < 1e-6
@@ -111,7 +111,7 @@ def test_noise_is_estimated_and_smoothed_away() -> None:
     assert not noisy.centring.is_none
     assert estimate_noise(mpc(FAR), noisy).level == pytest.approx(0.05, rel=0.2)
     assert estimate_noise(mpc(FAR), FAR_LOG).negligible
-    smooth = identify_smoothed(mpc(FAR), noisy).table
+    smooth = identify(mpc(FAR), noisy).table
     before, after = (np.sqrt(np.mean((t.observations - FAR_LOG.observations) ** 2, axis=0)) for t in (noisy, smooth))
     assert (after < 0.6 * before).all()
 

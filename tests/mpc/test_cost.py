@@ -83,7 +83,7 @@ def test_parameters_and_their_groups() -> None:
         ({"W": np.eye(2), "R": [[1.0]], "S": [[2.0], [0.0]]}, "H: expected a positive semidefinite matrix"),
         ({"W": np.eye(2), "R": [[1.0]], "S": [[0.0, 0.0]]}, r"S: expected shape \(2, 1\), got shape \(1, 2\)"),
         ({"W": np.ones((2, 3)), "R": [[1.0]], "S": [[0.0], [0.0]]}, "W: expected a square matrix"),
-        ({"W": np.eye(2), "S": [[0.0], [0.0]]}, "R: expected a matrix, as S or u_ref is given"),
+        ({"W": np.eye(2), "S": [[0.0], [0.0]]}, "R: expected a matrix, as S, D or u_ref is given"),
         ({"W": np.eye(2), "u_ref": [0.0]}, "R: expected a matrix"),
         ({"W": np.eye(2), "x_ref": [0.0]}, r"x_ref: expected shape \(2,\), got shape \(1,\)"),
         ({"W": np.eye(2), "R": [[1.0]], "u_ref": [0.0, 0.0]}, r"u_ref: expected shape \(1,\)"),

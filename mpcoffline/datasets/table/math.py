@@ -127,6 +127,7 @@ def innermost(
     nu: int,
     fraction: float,
     states: Callable[[NDArray[np.float32]], tuple[Any, Any]] | None = None,
+    count: int | None = None,
 ) -> NDArray[np.intp]:
     """The ``fraction`` of rows with the smallest max(|s / med|, |s+ / med|), med as :func:`magnitudes` gives it.
 
@@ -136,15 +137,17 @@ def innermost(
         nu: Number of action coordinates.
         fraction: In (0, 1].
         states: From a block of centred rows to s and s+, ``(B, ny)`` each, both from the centre.
+        count: How many coordinates count, the first ones; all by default.
 
     Returns:
         Their numbers, ascending.
     """
-    scale = magnitudes(rows, ny)
+    scale = magnitudes(rows, ny if count is None else count)
     score = np.empty(len(rows))
     for i in range(0, len(rows), CHUNK):
         block = rows[i : i + CHUNK]
-        s, s_next = split(block, ny, nu)[::3] if states is None else states(block)
+        both = split(block, ny, nu)[::3] if states is None else states(block)
+        s, s_next = (part[:, :count] for part in both)
         # float64: ratios of float32 numbers can overflow.
         reached = np.maximum(np.abs(s.T), np.abs(s_next.T)).astype(np.float64, order="C")
         score[i : i + CHUNK] = (reached / scale[:, None]).max(axis=0)

@@ -199,8 +199,8 @@ class TransitionTable:
             InvalidDataError: For a wrong shape, lengths that differ, no row at all, NaN or inf (in float32),
                 or terminations that are not boolean.
         """
-        columns = observations, actions, costs, next_observations, terminations
-        return cls._of(read_arrays(name, *columns, episode_ids), name)
+        arrays = observations, actions, costs, next_observations, terminations, episode_ids
+        return cls._of(read_arrays(name, *arrays), name)
 
     @classmethod
     def of(cls, data: TransitionTable | MinariDataset | str) -> TransitionTable:
@@ -274,6 +274,7 @@ class TransitionTable:
         blocks: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]],
         name: str | None = None,
         centring: Centring | None = None,
+        sizes: tuple[int, int] | None = None,
     ) -> TransitionTable:
         """A table of other rows, and of their size: a mapped one gives a mapped one, in a file that vanishes with it.
 
@@ -281,15 +282,16 @@ class TransitionTable:
             blocks: Packed rows ``(B, 2 ny + nu + 2)`` and their episodes ``(B,)``, one block after another.
             name: What error messages call it; the name of this one by default.
             centring: What they are packed without; as in this one by default.
+            sizes: Their ny and nu; likewise.
 
         Raises:
             StorageError: Where a mapped table cannot be written.
         """
-        centring = centring or self.centring
+        centring, (ny, nu) = centring or self.centring, sizes or (self.ny, self.nu)
         if self._file is None:
             rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-            return TransitionTable(rows, self.ny, self.nu, ids, name or self.name, centring=centring)
-        file = scratch_table(self.ny, self.nu, blocks, self._file.folder.parent, centring)
+            return TransitionTable(rows, ny, nu, ids, name or self.name, centring=centring)
+        file = scratch_table(ny, nu, blocks, self._file.folder.parent, centring)
         return self._of(file, name or self.name, self._memory)
 
     def check_fits(
@@ -310,14 +312,15 @@ class TransitionTable:
         check_sizes(self.name, {"observations": (self.ny, ny), "actions": (self.nu, nu)})
         check_bounds(self.name, self.actions, self.episode_ids, action_low, action_high)
 
-    def trim(self, fraction: float) -> TransitionTable:
+    def trim(self, fraction: float, count: int | None = None) -> TransitionTable:
         """Drops the transitions farthest out, on which a value regression would spend itself.
 
-        Keeps the ``fraction`` of rows with the smallest ``max(|s / med|, |s+ / med|)`` over all coordinates, with
-        med the median of ``|s|`` per coordinate (where that is zero its mean, where that is zero too, 1).
+        Keeps the rows with the smallest ``max(|s / med|, |s+ / med|)`` over the coordinates, with med the median of
+        ``|s|`` of each (where that is zero its mean, where that is zero too, 1).
 
         Args:
             fraction: Share of rows to keep, in (0, 1].
+            count: How many coordinates decide, the first ones; all by default.
 
         Returns:
             A new table, rows in the same order.
@@ -326,7 +329,7 @@ class TransitionTable:
             InvalidArgumentError: For another fraction.
         """
         check_number("fraction", fraction, 0.0, 1.0)
-        return self._take(innermost(self.rows, self.ny, self.nu, fraction, self.centring.states))
+        return self._take(innermost(self.rows, self.ny, self.nu, fraction, self.centring.states, count))
 
     def statistics(self) -> TableStatistics:
         """Mean, standard deviation and range of every column, in float64, in one pass over the table."""

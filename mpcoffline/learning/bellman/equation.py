@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.estimation.identification import FULL_TURN, Rows, without_jumps
+from mpcoffline.learning.stages import KnownCost
 from mpcoffline.learning.value.fit import ValueFunction
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.scaling import increments_scale
 from mpcoffline.mpc.torch_twin import TorchTwin
-
-
-def variance_of(costs: NDArray[np.floating[Any]]) -> float:
-    """The variance of logged costs ``(n,)``, the unit of the regression error; of one cost only, its square, or 1."""
-    if np.ptp(costs) == 0.0:
-        return float(costs[0]) ** 2 or 1.0
-    return float(costs.var(dtype=np.float64)) or 1.0
 
 
 class BellmanProblem:
@@ -28,19 +21,23 @@ class BellmanProblem:
 
     ::
 
-        E_D[ (L(s,a) + gamma V(s+) - gamma V(f_th(s,a)) - Lhat_th(s,a))^2 ] / Var_D[L]
+        min_c E_D[ (L(s,a) + gamma V(s+) - gamma V(f_th(s,a)) - Lhat_th(s,a) - c)^2 ] / Var_D[L]
 
-    After a terminal state both V vanish.
+    After a terminal state both V vanish. The constant c, theta_3 of (COST), is always the best one: no input depends on
+    it, so that neither a constant in the logged costs nor a stage cost without such a parameter matters.
 
     Args:
         mpc: The MPC whose functions f and Lhat are fitted.
         value: V_phi, constant here.
-        unit: The variance that the error is divided by.
+        unit: What errors are measured in, the spread of the cost.
+        cost: How L follows from Lhat, where that is known: then ``scale Lhat`` stands for Lhat here.
     """
 
-    def __init__(self, mpc: MPC, value: ValueFunction, unit: float) -> None:
+    def __init__(self, mpc: MPC, value: ValueFunction, unit: float, cost: KnownCost | None = None) -> None:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
+        self.n_states, self._ny = mpc.layout.n_states, mpc.ny
         self._value, self._discount, self.unit = value, mpc.discount, unit
+        self._scale = 1.0 if cost is None else cost.scale
 
     def discounted(self, batch: Columns) -> Tensor:
         """The weight of what follows, ``(B,)``: gamma, and zero after a terminal state."""
@@ -54,9 +51,12 @@ class BellmanProblem:
         return target
 
     def predicted(self, batch: Columns, theta: Tensor) -> Tensor:
-        """The predicted successor f_th(s,a), ``(B, ny)``."""
+        """The predicted successor f_th(s,a), ``(B, ny)``; signals, which no model predicts, are those of s+."""
         reached: Tensor = self._f(batch.observations.double(), batch.actions.double(), theta)
-        return reached
+        n, ny = self.n_states, self._ny
+        if n == ny:
+            return reached
+        return torch.cat([reached[:, :n], batch.next_observations[:, n:ny].double(), reached[:, ny:]], dim=1)
 
     def predicted_value(self, batch: Columns, theta: Tensor) -> Tensor:
         """The discounted value of the predicted successor, gamma V(f_th(s,a)), ``(B,)``."""
@@ -66,7 +66,7 @@ class BellmanProblem:
     def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:
         """Lhat_th(s,a), ``(B,)``."""
         cost: Tensor = self._stage(batch.observations.double(), batch.actions.double(), theta)
-        return cost.squeeze(-1)
+        return self._scale * cost.squeeze(-1)
 
     def error(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean squared error over a minibatch, a scalar."""
@@ -74,12 +74,12 @@ class BellmanProblem:
         return self.mean_square(self.target(batch) - explained)
 
     def mean_square(self, residuals: Tensor) -> Tensor:
-        """The mean square of residuals in units of the cost's variance."""
-        return residuals.square().mean() / self.unit
+        """The variance of residuals in units of the cost's: their mean square with the best constant."""
+        return ((residuals - residuals.mean()) / self.unit).square().mean()
 
 
 class PredictionError:
-    """The one-step prediction error, every coordinate in the spread of its increments.
+    """The one-step prediction error of the plant's states, every coordinate in the spread of its increments.
 
     ::
 
@@ -92,20 +92,24 @@ class PredictionError:
         problem: Has the model.
         sample: Transitions that decide the spread, and which coordinates are such angles.
         theta: Parameters with which the model predicts well enough to see jumps of a full turn.
+        centre: See :func:`~mpcoffline.mpc.scaling.increments_scale`.
     """
 
-    def __init__(self, problem: BellmanProblem, sample: Columns, theta: Tensor) -> None:
+    def __init__(self, problem: BellmanProblem, sample: Columns, theta: Tensor, centre: Array | float = 0.0) -> None:
         self._problem = problem
         s, a, reached = (part.double() for part in (sample.observations, sample.actions, sample.next_observations))
+        s, reached = s[:, : problem.n_states], reached[:, : problem.n_states]
         with torch.no_grad():
-            missed = reached - problem.predicted(sample, theta)
+            missed = reached - problem.predicted(sample, theta)[:, : problem.n_states]
         rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
-        spread = (torch.from_numpy(rows.reached) - s).std(dim=0, correction=0)
-        self._scale = torch.where(spread > 0.0, spread, 1.0)
+        self._scale = torch.from_numpy(
+            increments_scale(rows.x, rows.reached, np.atleast_1d(centre)[: problem.n_states])
+        )
 
     def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean error over a minibatch, a scalar."""
         missed = batch.next_observations.double() - self._problem.predicted(batch, theta)
+        missed = missed[:, : self._problem.n_states]
         if self._angles:
             turns = torch.zeros_like(missed)
             angles = list(self._angles)

@@ -15,7 +15,8 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.learning.potential import Potential
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
+from mpcoffline.mpc.scaling import Scaling
 
 from .equation import BellmanProblem
 
@@ -41,6 +42,7 @@ def refit_cost(
     theta: Array,
     problem: BellmanProblem,
     sample: Columns,
+    scaling: Scaling,
     *,
     prior: float,
     shaped: bool,
@@ -56,6 +58,7 @@ def refit_cost(
         theta: The start; its model is kept.
         problem: The regression error.
         sample: The transitions, all at once.
+        scaling: Their units.
         prior: Weight of the squared distance to the MPC's parameters in scaled coordinates.
         shaped: Whether the stage cost has a potential besides.
         max_iterations: Bound on the iterations.
@@ -63,12 +66,12 @@ def refit_cost(
     Raises:
         MPCOfflineError: If the fit is lost.
     """
-    nominal = Coordinates(mpc, ("cost",))
-    start = Coordinates(mpc.with_theta(theta), ("cost",))
+    nominal = Coordinates(mpc, ("cost",), scaling)
+    start = Coordinates(mpc.with_theta(theta), ("cost",), scaling)
     with torch.no_grad():
         target = problem.target(sample) - problem.predicted_value(sample, torch.from_numpy(theta))
         potential = Potential(sample.observations) if shaped else None
-        shaping = _shaping(potential, problem, sample, theta)
+        shaping = problem.unit * _shaping(potential, problem, sample, theta)
     offset = torch.from_numpy(nominal.z(theta))
     ratio = torch.from_numpy(start.scale / nominal.scale)
 
@@ -78,7 +81,7 @@ def refit_cost(
 
     def objective(point: Array) -> tuple[float, Array]:
         z = torch.from_numpy(point).requires_grad_()
-        distance = (offset + ratio * z[: start.size]).square().sum() + z[start.size :].square().sum() / problem.unit
+        distance = (offset + ratio * z[: start.size]).square().sum() + z[start.size :].square().sum()
         loss = problem.mean_square(residuals(z)) + prior * distance
         loss.backward()  # type: ignore[no-untyped-call]
         gradient = z.grad
@@ -102,11 +105,10 @@ def refit_cost(
     z = torch.from_numpy(found.x)
     fitted = canonical(mpc, start.theta(z[: start.size]).numpy())
     if potential is not None:
-        potential.coefficients = z[start.size :].clone()
+        potential.coefficients = problem.unit * z[start.size :]
     with torch.no_grad():
-        explained = problem.stage_cost(sample, torch.from_numpy(fitted)) + shaping @ z[start.size :]
-        error = problem.mean_square(target - explained)
-    return Refit(fitted, float(error), potential)
+        missed = target - problem.stage_cost(sample, torch.from_numpy(fitted)) - shaping @ z[start.size :]
+    return Refit(with_level(mpc, fitted, float(missed.mean())), float(problem.mean_square(missed)), potential)
 
 
 def _shaping(potential: Potential | None, problem: BellmanProblem, sample: Columns, theta: Array) -> Tensor:

@@ -13,13 +13,14 @@ from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.stages import FitResult, Metrics
+from mpcoffline.learning.stages import FitResult, KnownCost, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale
 
-from .equation import BellmanProblem, PredictionError, variance_of
+from .equation import BellmanProblem, PredictionError
 from .refit import refit_cost
 
 _log = logging.getLogger(__name__)
@@ -82,6 +83,7 @@ class ParameterTraining:
         groups: ``("cost",)`` for MPC_2, ``("cost", "model")`` for MPC_3.
         config: Prior and schedules.
         seed: Seeds the minibatches.
+        cost: How the logged costs follow from the MPC's, where that is known: then the stage cost stays.
 
     Raises:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
@@ -96,16 +98,19 @@ class ParameterTraining:
         config: ParameterConfig,
         *,
         seed: int,
+        cost: KnownCost | None = None,
     ) -> None:
+        self._groups = groups = groups if cost is None else tuple(group for group in groups if group != "cost")
         self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
         costs = table.costs
-        if len(costs) > 1 and np.ptp(costs) == 0.0:
-            _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
         self._rng = np.random.default_rng(seed)
-        self._problem = BellmanProblem(mpc, value, variance_of(costs))
+        self._problem = BellmanProblem(mpc, value, cost_spread(costs), cost)
         self._sample = table.columns(torch.from_numpy(table.sample(config.refit_rows, self._rng).rows))
-        self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta))
-        self._coordinates = Coordinates(mpc, groups)
+        s, a, _, reached, _ = (part.double().numpy() for part in self._sample)
+        centre = table.centring.centre[: table.ny]
+        self._prediction_error = PredictionError(self._problem, self._sample, torch.from_numpy(mpc.theta), centre)
+        self._scaling = Scaling(s, a, increments_scale(s, reached, centre), self._problem.unit)
+        self._coordinates = Coordinates(mpc, groups, self._scaling)
         with torch.no_grad():
             self._loss_before = float(self._problem.error(self._sample, torch.from_numpy(mpc.theta)))
         if not np.isfinite(self._loss_before):
@@ -211,11 +216,16 @@ class ParameterTraining:
         elif self._n_gradients:
             _log.warning("(FIT) of cost and model failed in every attempt; the model stays as it was")
         config = self.config
+        if "cost" not in self._groups:
+            with torch.no_grad():
+                error = float(self._problem.error(self._sample, torch.from_numpy(theta)))
+            return FitResult(theta, self._loss_before, error, tuple(self._coordinates.at_bounds(theta)))
         refit = refit_cost(
             self._mpc,
             theta,
             self._problem,
             self._sample,
+            self._scaling,
             prior=config.prior,
             shaped=config.potential,
             max_iterations=config.refit_iterations,

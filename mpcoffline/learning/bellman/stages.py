@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 
 from mpcoffline.core.checks import check_known, check_number
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.smoothing import identify_smoothed
+from mpcoffline.estimation import fit_residual, identify, with_residual
+from mpcoffline.estimation.delays import find_delays
+from mpcoffline.estimation.plant import settled
+from mpcoffline.learning.ends import ends_matter, priced_ends
+from mpcoffline.learning.linear_quadratic import riccati_cost
+from mpcoffline.learning.potential import Potential
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
@@ -20,11 +27,10 @@ from mpcoffline.mpc import MPC, NormCost, TerminalCost
 from .regression import ParameterConfig, ParameterTraining
 
 Init = Literal["nominal", "identified"]
-Terminal = Literal["given", "norm", "quadratic", "network"]
+Terminal = Literal["given", "norm", "quadratic", "network", "auto"]
 
 _log = logging.getLogger(__name__)
 
-_OTHER_MAGNITUDE = 30.0
 _SCALE_ROWS = 5_000
 _TERMINAL_ROWS = 100_000
 
@@ -39,25 +45,56 @@ class StartConfig:
         adapt_above: With ``init="identified"``, steps on cost and model together (``fit_n_steps``) are made only where
             the identified model misses more than this share of an increment (root mean square of the one-step
             errors): where its structure is not the plant's. Else the model stays and the cost alone is fitted.
+        delays: With ``init="identified"``, whether dead time is looked for in the data before all else, where the model
+            says nothing of it (``delay=None``), and checked where it does.
+        residual: With ``init="identified"``, whether a model that misses more than that gets a learned residual, if
+            held-out episodes ask for one (:func:`mpcoffline.estimation.fit_residual`); it stays then, too.
     """
 
     init: Init = "nominal"
     adapt_above: float = 0.0
+    delays: bool = True
+    residual: bool = False
 
     def __post_init__(self) -> None:
         check_known("init", self.init, get_args(Init))
         check_number("adapt_above", self.adapt_above, 0.0, open_low=False)
 
 
+def with_dead_time(known: Known, config: StartConfig) -> Known:
+    """The MPC with the dead time that the log shows, where its model says none; where it does, a check of that."""
+    if config.init == "nominal" or not config.delays or known.value_function is not None:
+        return known
+    model, search = known.mpc.model, find_delays(known.mpc, known.table, seed=known.seed)
+    if not search.found:
+        _log.info("Inputs: %s", search)
+    elif model.delay is None:
+        _log.warning("Inputs act late: found a %s. The learned MPC carries the past inputs.", search)
+        return replace(known, mpc=known.mpc.with_delay(search.delay))
+    else:
+        _log.warning("The model's delay is %s, the log says otherwise: a %s.", list(model.delay), search)
+    return known
+
+
 def identified(known: Known, config: StartConfig) -> Known:
     """The table without measurement noise, and the model, where it is learned, by its prediction error."""
     if config.init == "nominal":
         return known
-    found = identify_smoothed(known.mpc, known.table, seed=known.seed)
+    found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    mpc = known.mpc.with_theta(found.identification.theta)
-    return replace(known, mpc=mpc, table=found.table, model_error=found.identification.error_after)
+    known = replace(known, mpc=known.mpc.replace(model=found.model), table=found.table, model_error=found.error_after)
+    return completed(known) if config.residual and found.error_after > config.adapt_above else known
+
+
+def completed(known: Known) -> Known:
+    """The identified model with a learned residual, where held-out episodes ask for one."""
+    residual = fit_residual(known.mpc, known.table, known.seed)
+    _log.info("%s", residual)
+    if not residual.taken:
+        return known
+    mpc = with_residual(known.mpc, residual)
+    return replace(known, mpc=mpc, model_error=residual.one_step[1], residual_share=residual.share)
 
 
 class LearnValue(Stage):
@@ -97,12 +134,17 @@ class LearnParameters(Stage):
     def begin(self, known: Known) -> Training:
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
-        mpc, config = in_units_of(known.mpc, known.table), self._adapting(known.model_error)
-        return ParameterTraining(mpc, known.constant_value, known.table, known.groups, config, seed=known.seed)
+        mpc = known.mpc if known.cost is not None else in_units_of(known.mpc, known.table)
+        value, config, table = known.constant_value, self._adapting(known), known.table
+        if known.cost is None and ends_matter(table, mpc.discount):  # of which T knows; no stage cost explains them
+            table = table.take(np.flatnonzero(np.asarray(table.terminations) == 0.0))
+        return ParameterTraining(mpc, value, table, known.groups, config, seed=known.seed, cost=known.cost)
 
-    def _adapting(self, missed: float | None) -> ParameterConfig:
-        """The configuration, without steps on a model that was identified and predicts well."""
-        config = self._config
+    def _adapting(self, known: Known) -> ParameterConfig:
+        """The configuration, without steps on a model that was identified and predicts well, or has the right cost."""
+        config, missed = self._config, 0.0 if known.residual_share else known.model_error
+        if known.cost is not None and (known.cost.constant or missed is not None):
+            return replace(config, n_steps=0)
         if missed is None or not config.n_steps:
             return config
         if missed <= self._adapt_above:
@@ -118,7 +160,8 @@ class LearnParameters(Stage):
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds theta and the result."""
-        return replace(known, mpc=known.mpc.with_theta(training.result.theta), result=training.result)
+        result = replace(training.result, residual_share=known.residual_share)
+        return replace(known, mpc=known.mpc.with_theta(result.theta), result=result)
 
 
 @dataclass(frozen=True)
@@ -127,7 +170,9 @@ class TerminalConfig:
 
     Attributes:
         method: ``"given"`` keeps the given one's, ``"norm"`` is (TERM), ``"quadratic"`` and ``"network"`` are fitted
-            to V, as Theorem 1 asks for (doi:10.1109/TAC.2019.2913768).
+            to V, as Theorem 1 asks for (doi:10.1109/TAC.2019.2913768); ``"auto"`` is the exact value of the learned
+            MPC where it has one, with an affine model and a quadratic stage cost
+            (:func:`~mpcoffline.learning.linear_quadratic.riccati_cost`), else ``"network"``.
         blend: Share of the convex quadratic in ``"network"``: steadier at short horizons.
     """
 
@@ -139,42 +184,69 @@ class TerminalConfig:
         check_number("blend", self.blend, 0.0, 1.0, open_low=False)
 
 
-def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
-    """The MPC with the terminal cost that is asked for: T = V - Phi, or none from V."""
-    kind = config.method
-    if kind == "given":
+def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | None = None) -> Known:
+    """The MPC with the terminal cost that is asked for: T = V - Phi, or none from V.
+
+    The exact value of an MPC is V - Phi of its own: Phi changes none of its inputs. Where all logged costs are one
+    number, V is in no unit of the stage cost: then the given terminal cost stays, and with it the given horizon, unless
+    one was asked for (``horizon``).
+    """
+    if config.method == "given":
         return known
-    goal = np.zeros(known.mpc.nx) if known.mpc.reference is None else known.mpc.reference
-    cost: TerminalCost = NormCost(goal)
-    if kind != "norm":
+    if known.cost is not None and known.cost.constant:
+        mpc = known.mpc if horizon is not None or known.given is None else _as_far_as(known.given, known.mpc)
+        return replace(known, mpc=mpc)
+    goal = settled(known.mpc, known.table)
+    exact = riccati_cost(known.mpc) if config.method == "auto" else None
+    cost: TerminalCost = NormCost(goal) if exact is None else exact
+    if exact is not None:
+        _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")
+    elif config.method != "norm":
         value, potential = known.constant_value, None if known.result is None else known.result.potential
+        scale = 1.0 if known.cost is None else known.cost.scale
         cost = fit_terminal(
-            kind,
-            value if potential is None else lambda s: value(s) - potential(s),
+            "quadratic" if config.method == "quadratic" else "network",
+            lambda s: (value(s) if potential is None else value(s) - potential(s)) / scale,
             known.table.sample(_TERMINAL_ROWS, 0).observations,
             x_ref=goal,
             blend=config.blend,
             seed=known.seed,
+            ends=_ends(known, potential),
         )
     mpc = known.mpc.replace(terminal_cost=cost)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
 
 
-def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
-    """The MPC with the weights of its stage cost scaled to the logged cost, where these are of other magnitudes.
+def _as_far_as(given: MPC, mpc: MPC) -> MPC:
+    """The MPC with the given one's horizon and discount."""
+    return mpc.replace(horizon=given.horizon, discount=given.discount)
 
-    (FIT) measures distances in the size of theta_0, which has to be that of the cost in the data within a factor of 30.
+
+def _ends(known: Known, potential: Potential | None) -> tuple[Array, Array] | None:
+    """Where episodes end at a price, and T there; with Phi, ``Lhat + Phi(s) + gamma T(s+) = L``."""
+    ends = priced_ends(known.mpc, known.table, known.cost)
+    if ends is None:
+        return None
+    shaping = 0.0 if potential is None else potential(torch.from_numpy(ends.before)).numpy() / known.mpc.discount
+    return ends.states, np.asarray(ends.values - shaping)
+
+
+def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
+    """The MPC with the weights of its stage cost scaled to the logged cost, which has its unit from whoever logged it.
+
+    (FIT) is drawn to theta_0, of which the ratios of the weights count, not their size.
     """
     rows = table.sample(_SCALE_ROWS, 0)  # at random: a stride would meet the length of episodes
     stage = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full()
     logged, nominal = float(rows.costs.std(dtype=np.float64)), float(stage.std())
     factor = logged / nominal if nominal > 0.0 else 1.0
-    if not np.isfinite(factor) or 1.0 / _OTHER_MAGNITUDE < factor < _OTHER_MAGNITUDE or factor == 0.0:
+    if not np.isfinite(factor) or factor == 0.0:
         return mpc
     weights = [block.name for block in mpc.space if block.group == "cost" and block.kind == "psd"]
     theta = mpc.theta
     for name in weights:
         theta[mpc.space.slices[name]] *= np.sqrt(factor)  # of W = C C'
-    outcome = f"{', '.join(weights)} scaled to it" if weights else "scale that by hand"
-    _log.warning("the logged cost varies %.3g times as much as the MPC's stage cost: %s", factor, outcome)
+    _log.info(
+        "the logged cost varies %.3g times as much as the MPC's stage cost, whose weights are scaled to it", factor
+    )
     return mpc.with_theta(theta)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from importlib import resources
 
@@ -12,50 +11,19 @@ import numpy as np
 from mpcoffline.core import limits
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.expressions import Instruction, expanded
+from mpcoffline.mpc.layers import layered
 from mpcoffline.solvers.linear_quadratic import promises_convexity
 from mpcoffline.solvers.scaling import costs_of
 
-from .elimination import arithmetic, value_and_jacobian
+from .elimination import value_and_jacobian
+from .emission import emit
+from .layered import LayeredCode
 
-_INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*"}
-_FORMATS = {
-    ca.OP_NEG: "-{0}",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "{0} + {0}",
-    ca.OP_FABS: "vd_abs({0})",
-    ca.OP_SIGN: "vd_bool({0} > 0.0) - vd_bool({0} < 0.0)",
-    ca.OP_NOT: "vd_bool({0} == 0.0)",
-    ca.OP_FMIN: "vd_min({0}, {1})",
-    ca.OP_FMAX: "vd_max({0}, {1})",
-    ca.OP_POW: "vd_pow({0}, {1})",
-    ca.OP_CONSTPOW: "vd_pow({0}, {1})",
-    ca.OP_ATAN2: "vd_atan2({0}, {1})",
-    ca.OP_HYPOT: "vd_hypot({0}, {1})",
-    ca.OP_FMOD: "vd_fmod({0}, {1})",
-    ca.OP_REMAINDER: "vd_remainder({0}, {1})",
-    ca.OP_COPYSIGN: "vd_copysign({0}, {1})",
-    ca.OP_LT: "vd_bool({0} < {1})",
-    ca.OP_LE: "vd_bool({0} <= {1})",
-    ca.OP_EQ: "vd_bool({0} == {1})",
-    ca.OP_NE: "vd_bool({0} != {1})",
-    ca.OP_AND: "vd_bool(({0} != 0.0) & ({1} != 0.0))",
-    ca.OP_OR: "vd_bool(({0} != 0.0) | ({1} != 0.0))",
-    ca.OP_IF_ELSE_ZERO: "vd_select({0} != 0.0, {1}, V(0.0))",
-} | {
-    getattr(ca, f"OP_{name.upper()}"): f"vd_{name}({{0}})"
-    for name in (
-        "sqrt exp log log1p expm1 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil erf".split()  # noqa: SIM905
-    )
-}
-
-
-# GCC's effort grows with the square of a function's length. Only functions of costs that are networks are so long.
-_LONGEST = 2500
-_PIECE = 500
 _LARGEST_BENT = 2000  # nodes of a model whose second derivatives are taken: they double the code
 # Inlined, the time of a cart-pole's expansion depends on where the linker puts it, by a quarter.
 _ATTRIBUTES = {"gen_q": "NOINLINE "}
+# What is emitted of a model with layers instead: the rest of the functions, which are composed of it and the layers.
+_WITH_LAYERS = {"gen_step": "gen_cost", "gen_q": "gen_q_of_model"}
 
 
 def source(mpc: MPC) -> str:
@@ -82,10 +50,12 @@ def generated(mpc: MPC) -> str:
     z = ca.vertcat(x, u)
     reached = mpc.dynamics_function(x, u, theta)
     cost, final, *_ = costs_of(mpc, x, u, theta)
-    _check_size(mpc, ca.vertcat(reached, cost, final))
+    layers = _layers(mpc, theta) if ca.n_nodes(reached) > _LARGEST_BENT else None
+    _check_size(mpc, ca.vertcat(cost, final), layers.n_scalars if layers else ca.n_nodes(reached))
     final_hessian, final_gradient = ca.hessian(final, x)
     hessian, slope = ca.hessian(cost, z)
-    linearised = value_and_jacobian(reached, z, theta)
+    array = ca.SX.sym("model", mpc.nx * (1 + mpc.nx + mpc.nu))  # in which model_slopes hands them over
+    linearised = value_and_jacobian(reached, z, theta) if layers is None else _in_array(mpc, array)
     inputs = {
         "gen_step": [x, u],
         "gen_final": [x],
@@ -93,7 +63,7 @@ def generated(mpc: MPC) -> str:
         "gen_q": [x, u, following, gradient, curvature, discount],
     }
     outputs = {
-        "gen_step": _stacked(reached, cost),
+        "gen_step": _stacked(*([] if layers else [reached]), cost),
         "gen_final": _stacked(final),
         "gen_final_expand": _stacked(final_gradient, _triangle(final_hessian)),
     }
@@ -106,27 +76,69 @@ def generated(mpc: MPC) -> str:
         slope, hessian = stage[: mpc.nx + mpc.nu], _symmetric(stage[mpc.nx + mpc.nu :], mpc.nx + mpc.nu)
     bent = _bent(reached, z) if exact else None
     outputs["gen_q"] = _action_value(*linearised, slope, hessian, following, gradient, curvature, discount, bent)
+    if layers is not None:
+        inputs["gen_q"].append(array)
+        inputs |= {name: [read] for name, (read, _) in layers.functions.items()}
+        outputs |= {name: given for name, (_, given) in layers.functions.items()}
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
     convex = int(as_is), int(promises_convexity(mpc.terminal_cost))
+    names = {} if layers is None else _WITH_LAYERS
     parts = [
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
+        *([] if layers is None else [text("layers.c"), *layers.maps()]),
         emit("gen_prepare", [theta], prepared),
         *(
-            emit(name, [*inputs[name], parameters], body, _ATTRIBUTES.get(name, ""))
+            emit(names.get(name, name), [*inputs[name], parameters], body, _ATTRIBUTES.get(name, ""))
             for name, body in zip(outputs, bodies, strict=True)
         ),
+        *([] if layers is None else [layers.drivers(), _composed(stage_expansion=not as_is)]),
     ]
     return "\n\n".join(parts)
 
 
-def _check_size(mpc: MPC, functions: ca.SX) -> None:
-    """Refuses what no compiler is through with in minutes, before its derivatives are taken."""
+def _layers(mpc: MPC, theta: ca.SX) -> LayeredCode | None:
+    """The model as loops over its layers' matrices, if it has any."""
+    structure = layered(mpc.dynamics_function)
+    return None if structure is None else LayeredCode(structure, mpc.nx, mpc.nu, theta)
+
+
+def _in_array(mpc: MPC, array: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """The successor and its Jacobian by (x, u), row by row in an array; what is zero in any case is so."""
+    pattern = ca.horzcat(*(ca.DM(mpc.dynamics_function.jac_sparsity(0, i), 1.0) for i in (0, 1)))
+    full = ca.reshape(array[mpc.nx :], mpc.nx + mpc.nu, mpc.nx).T
+    return array[: mpc.nx], full * ca.SX(pattern)
+
+
+def _composed(*, stage_expansion: bool) -> str:
+    """``gen_step`` and ``gen_q``, of the model's layers and the functions in :data:`_WITH_LAYERS`."""
+    typed, passed = ("const vd *stage, ", "stage, ") if stage_expansion else ("", "")
+    return f"""static void gen_step(const vd *x, const vd *u, const vd *p, vd *out) {{
+    model_values(x, u, p, out);
+    gen_cost(x, u, p, out + NX);
+}}
+
+static NOINLINE void gen_q(const vd *x, const vd *u, const vd *following, const vd *Vx, const vd *Vxx,
+                           const vd *discount, {typed}const vd *p, vd *out) {{
+    vd model[NX * (1 + NZ)];
+    model_slopes(x, u, p, model);
+    gen_q_of_model(x, u, following, Vx, Vxx, discount, {passed}model, p, out);
+}}"""
+
+
+def _check_size(mpc: MPC, costs: ca.SX, n_model: int) -> None:
+    """Refuses what no compiler is through with in minutes, before its derivatives are taken.
+
+    Args:
+        mpc: The problem.
+        costs: Expressions of its costs.
+        n_model: Scalar operations of its model, without those of layers.
+    """
     dynamics = mpc.dynamics_function
     derivatives = sum(dynamics.jac_sparsity(0, i).nnz() for i in (0, 1))
     for what, found, most in (
-        ("operations", ca.n_nodes(functions), limits.COMPILED_NODES),
+        ("operations", ca.n_nodes(costs) + n_model, limits.COMPILED_NODES),
         ("products of derivatives", 2 * derivatives * (mpc.nx + mpc.nu), limits.COMPILED_PRODUCTS),
     ):
         if found > most:
@@ -213,90 +225,6 @@ def _hoisted(bodies: list[ca.SX], theta: ca.SX) -> tuple[list[ca.SX], ca.SX, ca.
 def _stacked(*parts: ca.SX) -> ca.SX:
     """Matrices as one dense column, each column-major."""
     return ca.vertcat(*(ca.vec(ca.densify(part)) for part in parts))
-
-
-def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> str:
-    """One C function ``name(i0, i1, ..., out)`` of vectors of doubles; a long one calls pieces of itself in turn.
-
-    The attribute stands in front of it, e.g. ``"NOINLINE "``.
-
-    Raises:
-        InvalidArgumentError: For an operation without a counterpart in C.
-    """
-    function = expanded(ca.Function(name, inputs, [output]))
-    program = arithmetic(function)
-    pointers = [f"i{k}" for k in range(len(inputs))]
-    arguments = "".join(f"const vd *{pointer}, " for pointer in pointers) + "vd *out"
-    if len(program) <= _LONGEST:
-        return _function(name, arguments, _statements(name, program, len(program)), pointers, attribute)
-    work, pieces, calls = f"vd w[{function.sz_w()}];", [], []
-    statements = _statements(name, program, _PIECE)
-    for k, start in enumerate(range(0, len(program), _PIECE)):
-        lines = statements[start : start + _PIECE]
-        pieces.append(
-            _function(f"{name}_{k}", f"{arguments}, vd *RESTRICT w", lines, [*pointers, "out", "w"], "NOINLINE ")
-        )
-        calls.append(f"{name}_{k}({', '.join(pointers)}, out, w);")
-    return "\n\n".join([*pieces, _function(name, arguments, [work, *calls], [])])
-
-
-def _function(name: str, arguments: str, statements: list[str], unused: list[str], attribute: str = "") -> str:
-    """A C function; of ``unused``, those that the statements do not name are marked so."""
-    named = set(re.findall(r"\b(?:i\d+|out|w)\b", " ".join(statements)))
-    marks = [f"(void){argument};" for argument in unused if argument not in named]
-    lines = [f"    {line}" for line in (*marks, *statements)]
-    return "\n".join([f"{attribute}static void {name}({arguments}) {{", *lines, "}"])
-
-
-def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
-    """One C statement an instruction; values that a later piece reads go through the array ``w`` of all pieces.
-
-    Divisions multiply by reciprocals, as a model's derivatives divide by the same few numbers again and again.
-    """
-    value_in: dict[int, int] = {}  # by place in the work vector: the instruction whose value is there
-    read: list[dict[int, int]] = []  # of each instruction: the places that it reads, and whose values they are
-    last_read: dict[int, int] = {}
-    for k, (op, sources, targets, _) in enumerate(program):
-        read.append({} if op in (ca.OP_INPUT, ca.OP_CONST) else {place: value_in[place] for place in sources})
-        last_read.update(dict.fromkeys(read[-1].values(), k))
-        if op != ca.OP_OUTPUT:
-            value_in[targets[0]] = k
-    statements = []
-    reciprocals: set[tuple[int, int]] = set()  # those that are known: piece, number of the divisor
-    for k, (op, sources, targets, constant) in enumerate(program):
-        start = k - k % piece
-        first = ""
-        names = [
-            f"v{read[k][place]}" if read[k][place] >= start else f"w[{place}]" for place in sources if place in read[k]
-        ]
-        if op == ca.OP_OUTPUT:
-            statements.append(f"out[{targets[1]}] = {names[0]};")
-            continue
-        if op == ca.OP_CONST:
-            result = f"V({_literal(constant)})"
-        elif op == ca.OP_INPUT:
-            result = f"i{sources[0]}[{sources[1]}]"
-        elif op in _INFIX:
-            result = f"{names[0]} {_INFIX[op]} {names[1]}"
-        elif op in (ca.OP_DIV, ca.OP_INV):
-            divisor = read[k][sources[-1]]
-            if (start, divisor) not in reciprocals:
-                reciprocals.add((start, divisor))
-                first = f"const vd r{divisor} = 1.0 / {names[-1]}; "
-            result = " * ".join([*names[:-1], f"r{divisor}"])
-        elif op in _FORMATS:
-            result = _FORMATS[op].format(*names)
-        else:
-            raise InvalidArgumentError(name, expected="operations that C has", actual=f"CasADi operation {op}")
-        kept = f" w[{targets[0]}] = v{k};" if last_read.get(k, k) >= start + piece else ""
-        statements.append(f"{first}const vd v{k} = {result};{kept}")
-    return statements
-
-
-def _literal(value: float) -> str:
-    if np.isinf(value):
-        return "INFINITY" if value > 0 else "-INFINITY"
-    return repr(float(value))
 
 
 def text(name: str) -> str:

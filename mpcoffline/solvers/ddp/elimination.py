@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from heapq import heapify, heappop, heappush
 
 import casadi as ca
@@ -23,7 +23,7 @@ _PARTIALS: dict[int, Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ...]]] = {
 }
 
 
-class _Graph:
+class Graph:
     """The results of a computation, numbered as they arise, and the partial derivatives between them."""
 
     def __init__(self) -> None:
@@ -32,12 +32,14 @@ class _Graph:
         self.out_of: list[dict[int, ca.SX]] = []  # of each result: the derivatives of those computed from it, by it
 
     def add(self, value: ca.SX) -> int:
+        """A new result; its number."""
         self.values.append(value)
         self.into.append({})
         self.out_of.append({})
         return len(self.values) - 1
 
     def connect(self, source: int, target: int, derivative: ca.SX) -> None:
+        """Adds a path between two results."""
         before = self.into[target].get(source)
         total = derivative if before is None else before + derivative
         self.into[target][source] = self.out_of[source][target] = total
@@ -53,7 +55,30 @@ class _Graph:
                 self.connect(source, target, outer * inner)
 
     def paths_through(self, k: int) -> int:
+        """How many paths lead through a result."""
         return len(self.into[k]) * len(self.out_of[k])
+
+    def eliminate_all(self, numbers: Iterable[int], *, growing: bool = True) -> None:
+        """Eliminates results, the one with the fewest paths through it first.
+
+        Args:
+            numbers: Which; each is computed from others.
+            growing: Whether also those through which there are more paths than edges.
+        """
+        left = set(numbers)
+        queue = [(self.paths_through(k), k) for k in left]
+        heapify(queue)
+        while left and queue:
+            paths, k = heappop(queue)
+            if k not in left or paths != self.paths_through(k):  # overtaken by a later entry
+                continue
+            left.remove(k)
+            if not growing and paths > len(self.into[k]) + len(self.out_of[k]):
+                continue
+            neighbours = [n for n in (*self.into[k], *self.out_of[k]) if n in left]
+            self.eliminate(k)
+            for neighbour in neighbours:
+                heappush(queue, (self.paths_through(neighbour), neighbour))
 
 
 def value_and_jacobian(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -70,17 +95,7 @@ def value_and_jacobian(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[ca.SX
     graph, variables, results = _recorded(expression, z, theta)
     fixed = {*variables, *results}
     left = {k for k in range(len(graph.values)) if k not in fixed and graph.into[k]}
-    queue = [(graph.paths_through(k), k) for k in left]
-    heapify(queue)
-    while left:
-        paths, k = heappop(queue)
-        if k not in left or paths != graph.paths_through(k):  # overtaken by a later entry
-            continue
-        left.remove(k)
-        neighbours = [n for n in (*graph.into[k], *graph.out_of[k]) if n in left]
-        graph.eliminate(k)
-        for neighbour in neighbours:
-            heappush(queue, (graph.paths_through(neighbour), neighbour))
+    graph.eliminate_all(left)
     jacobian = ca.SX(len(results), len(variables))
     for row, result in enumerate(results):
         for column, variable in enumerate(variables):
@@ -89,14 +104,14 @@ def value_and_jacobian(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[ca.SX
     return ca.vertcat(*(graph.values[k] for k in results)), jacobian
 
 
-def _recorded(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[_Graph, list[int], list[int]]:
+def _recorded(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[Graph, list[int], list[int]]:
     """The graph of a column of expressions, and the numbers of z and of its results; constants of z have no edges.
 
     Raises:
         InvalidArgumentError: For an expression that calls functions.
     """
     function = expanded(ca.Function("f", [z, theta], [expression]))
-    graph = _Graph()
+    graph = Graph()
     variables = [graph.add(z[i]) for i in range(z.numel())]
     varying, results = set(variables), {}
     number_at: dict[int, int] = {}  # by place in the work vector: the result that is there
@@ -113,7 +128,7 @@ def _recorded(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[_Graph, list[i
                 graph.connect(source, results[targets[1]], ca.SX(1))
         else:
             operands = [number_at[place] for place in sources]
-            number_at[targets[0]] = k = _applied(graph, op, operands, varying)
+            number_at[targets[0]] = k = applied(graph, op, operands, varying)
             if any(operand in varying for operand in operands):
                 varying.add(k)
     return graph, variables, [results[i] for i in range(expression.numel())]
@@ -136,7 +151,7 @@ def arithmetic(function: ca.Function) -> list[Instruction]:
     return program
 
 
-def _applied(graph: _Graph, op: int, operands: list[int], varying: set[int]) -> int:
+def applied(graph: Graph, op: int, operands: list[int], varying: set[int]) -> int:
     """Adds an operation with its derivatives by the operands that vary; its number."""
     a, *rest = (graph.values[k] for k in operands)
     value = ca.SX.binary(op, a, rest[0]) if rest else ca.SX.unary(op, a)

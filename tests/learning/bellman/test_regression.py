@@ -19,6 +19,7 @@ from mpcoffline.learning import FitResult, ParameterConfig, ParameterTraining, V
 from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.scaling import Scaling
 from mpcoffline.plants.nominal import nominal_mpc
 
 Array = NDArray[np.float64]
@@ -68,12 +69,12 @@ def test_the_error_is_its_formula_evaluated_by_casadi_and_numpy(env_id: str) -> 
     residual = columns.costs + mpc.discount * alive * bellman - stage
     problem = BellmanProblem(mpc, value, unit)
     found = problem.error(table.columns(torch.from_numpy(table.rows)), torch.from_numpy(theta))
-    assert float(found) == pytest.approx(float(np.mean(residual**2)) / unit, rel=1e-5)
+    assert float(found) == pytest.approx(float(np.var(residual)) / unit**2, rel=1e-5)
 
 
 def test_the_errors_gradient_is_its_slope() -> None:
     mpc, table = nominal_mpc(SWING_UPS[0], alpha=0.5, seed=0), swing_up_log(SWING_UPS[0])
-    problem, coordinates = BellmanProblem(mpc, network(table).double(), 1.0), Coordinates(mpc, BOTH)
+    problem, coordinates = BellmanProblem(mpc, network(table).double(), 1.0), Coordinates(mpc, BOTH, scaling_of(mpc))
     batch = table.columns(torch.from_numpy(table.rows.astype(np.float64)))
     rng = np.random.default_rng(0)
     z = torch.from_numpy(0.1 * rng.normal(size=coordinates.size)).requires_grad_()
@@ -89,6 +90,12 @@ def test_the_errors_gradient_is_its_slope() -> None:
 
 
 # ---------------------------------------------------------------- coordinates
+
+
+def scaling_of(mpc: MPC) -> Scaling:
+    """That of states of unit spread, whose increments spread by 0.5, and costs that spread by 3."""
+    rng = np.random.default_rng(0)
+    return Scaling(rng.normal(size=(4_000, mpc.nx)), rng.normal(size=(4_000, mpc.nu)), np.full(mpc.nx, 0.5), cost=3.0)
 
 
 def bounded_mpc() -> MPC:
@@ -114,14 +121,14 @@ def bounded_mpc() -> MPC:
 @pytest.mark.parametrize("groups", [COST, BOTH])
 @pytest.mark.parametrize("mpc", [bounded_mpc(), *(nominal_mpc(env_id, 0.5, 1) for env_id in SWING_UPS)])
 def test_zero_is_theta_0_bit_for_bit(mpc: MPC, groups: tuple[str, ...]) -> None:
-    coordinates = Coordinates(mpc, groups)
+    coordinates = Coordinates(mpc, groups, scaling_of(mpc))
     found = coordinates.theta(torch.zeros(coordinates.size, dtype=torch.float64)).numpy()
     np.testing.assert_array_equal(found, mpc.theta)
 
 
 def test_coordinates_reach_their_bounds_and_come_back() -> None:
     mpc = bounded_mpc()
-    coordinates = Coordinates(mpc, BOTH)
+    coordinates = Coordinates(mpc, BOTH, scaling_of(mpc))
     names = [name for name, learned in zip(mpc.space.names, coordinates.mask, strict=True) if learned]
     for sign, bound, limit in ((-1, coordinates.low, mpc.space.low), (1, coordinates.high, mpc.space.high)):
         z = torch.from_numpy(np.where(np.isfinite(bound), bound, 3.0 * sign))
@@ -141,28 +148,51 @@ def test_coordinates_reach_their_bounds_and_come_back() -> None:
 def test_only_the_chosen_groups_move() -> None:
     mpc = bounded_mpc()
     for groups in (COST, BOTH):
-        coordinates = Coordinates(mpc, groups)
+        coordinates = Coordinates(mpc, groups, scaling_of(mpc))
         moved = coordinates.theta(torch.ones(coordinates.size, dtype=torch.float64)).numpy() != mpc.theta
         np.testing.assert_array_equal(moved, mpc.space.mask(groups))
         assert coordinates.size == moved.sum()
 
 
-def test_sizes_are_those_of_rows_and_blocks() -> None:
+def test_units_are_sizes_or_effects() -> None:
     mpc = bounded_mpc()
-    coordinates = Coordinates(mpc, BOTH)
+    coordinates = Coordinates(mpc, BOTH, scaling_of(mpc))
     names = [name for name, learned in zip(mpc.space.names, coordinates.mask, strict=True) if learned]
     scale = dict(zip(names, coordinates.scale, strict=True))
-    assert [scale[f"model.G[{i},{j}]"] for i in (0, 1) for j in (0, 1)] == [4.0] * 4
+    # The states spread alike, so the entries of G have the size of the largest.
+    assert [scale[f"model.G[{i},{j}]"] for i in (0, 1) for j in (0, 1)] == pytest.approx([4.0] * 4, rel=0.1)
     assert scale["model.c"] == pytest.approx(0.3)
-    assert scale["model.zero"] == 1.0
+    assert scale["model.zero"] == pytest.approx(0.5 / np.sqrt(2.0))  # adds to both states
+    assert scale["stage_cost.constant"] == pytest.approx(3.0)
     assert scale["stage_cost.W[0,0]"] == pytest.approx(2.0)
     assert scale["stage_cost.W[1,0]"] == scale["stage_cost.W[1,1]"] == pytest.approx(np.sqrt(2.0))
-    assert scale["stage_cost.R[0,0]"] == pytest.approx(0.1)  # a tenth of 1, as the whole block is zero
+    # R is zero: C^2 u^2 should be as large as the spread of the cost, and E[u^4] = 3.
+    assert scale["stage_cost.R[0,0]"] == pytest.approx(np.sqrt(3.0 / np.sqrt(3.0)), rel=0.1)
+
+
+@pytest.mark.parametrize("powers", [(0, 7, -3), (-20, 4, 8)])
+def test_units_follow_those_of_the_data(powers: tuple[int, int, int]) -> None:
+    """Position in 2^a m, speed in 2^b m/s, cost in 4^c: every coordinate of theta takes the unit that it has."""
+    a, b, c = (2.0**power for power in powers)
+    rng = np.random.default_rng(0)
+    s, u = rng.normal(size=(300, 2)) * [1.0, 3.0], rng.normal(size=(300, 1))
+
+    def units(a: float, b: float, c: float) -> NDArray[np.float64]:
+        D = np.diag([a, b])
+        A = D @ np.array([[1.0, 0.1], [0.0, 0.9]]) @ np.linalg.inv(D)
+        W = c**2 * np.linalg.inv(D) @ np.diag([1.0, 1e-4]) @ np.linalg.inv(D)
+        model = Model(lambda x, v, p: p["A"] @ x + p["b"] * v[0], 2, 1, 0.1, {"A": A, "b": np.zeros(2)}, discrete=True)
+        mpc = MPC(model, QuadraticCost(W, [[0.0]]), NormCost([0.0, 0.0]), 5, 0.9, [-1.0], [1.0])
+        scaling = Scaling(s @ D, u, np.array([0.3, 0.2]) @ D, 5.0 * c**2)
+        return np.asarray(scaling.units(mpc, BOTH)[mpc.space.mask(BOTH)])
+
+    expected = np.array([1.0, a / b, b / a, 1.0, a, b, c / a, c / b, c / b, c, c**2])
+    np.testing.assert_array_equal(units(a, b, c), expected * units(1.0, 1.0, 1.0))
 
 
 def test_gradients_stay_finite_far_out() -> None:
     mpc = bounded_mpc()
-    coordinates = Coordinates(mpc, BOTH)
+    coordinates = Coordinates(mpc, BOTH, scaling_of(mpc))
     # exp(1000) overflows; coordinates that are not logarithmic must not notice.
     z = torch.where(torch.from_numpy(coordinates.logarithmic), 1.0, 1_000.0).double().requires_grad_()
     coordinates.theta(z).sum().backward()
@@ -344,19 +374,22 @@ def test_the_published_cost_is_fitted_as_well_as_a_convex_search_can() -> None:
 # ---------------------------------------------------------------- prior, bounds, groups
 
 
+def without_constant(mpc: MPC, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Theta without what the prior does not hold, as no input depends on it."""
+    return np.delete(theta, mpc.space.names.index("stage_cost.constant"))
+
+
 @pytest.mark.parametrize("groups", [COST, BOTH])
 def test_a_huge_prior_keeps_theta_0(groups: tuple[str, ...]) -> None:
     mpc = lq_plant.make_mpc()
     result = fit(mpc, BEST.P, noisy_log(300), groups, prior=1e9, n_steps=300)
-    np.testing.assert_allclose(result.theta, mpc.theta, atol=1e-4)
+    np.testing.assert_allclose(without_constant(mpc, result.theta), without_constant(mpc, mpc.theta), atol=1e-4)
 
 
 def test_the_prior_pulls_towards_theta_0() -> None:
     mpc = lq_plant.make_mpc()
-    distances = [
-        float(np.linalg.norm(fit(mpc, BEST.P, noisy_log(300), COST, prior=prior).theta - mpc.theta))
-        for prior in (0.0, 1.0, 100.0)
-    ]
+    fitted = [fit(mpc, BEST.P, noisy_log(300), COST, prior=prior).theta for prior in (0.0, 1.0, 100.0)]
+    distances = [float(np.linalg.norm(without_constant(mpc, theta - mpc.theta))) for theta in fitted]
     assert distances == sorted(distances, reverse=True)
     assert distances[-1] < 0.2 * distances[0]
 

@@ -1,0 +1,75 @@
+"""What a policy hands from step to step in SB3's ``state``: its plan, and past inputs where the MPC holds some."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
+from mpcoffline.mpc import MPC
+from mpcoffline.solvers import Plan
+
+
+class Course(NamedTuple):
+    """A plan and the inputs that were applied: the state of a policy whose MPC holds past inputs.
+
+    Attributes:
+        x: As in :class:`~mpcoffline.solvers.Plan`.
+        u: Likewise.
+        memory: Inputs applied in the steps before, ``(B, n_memory)`` in the order of ``mpc.layout.names``; a row of
+            NaN is one that is not known.
+    """
+
+    x: Array
+    u: Array
+    memory: Array
+
+
+def course_from(
+    mpc: MPC, state: tuple[NDArray[Any], ...] | None, episode_start: ArrayLike | None, n_problems: int
+) -> tuple[Plan, Array | None]:
+    """The plan to start from and the past inputs ``(B, n_memory)``; None where the MPC holds none.
+
+    Args:
+        mpc: The MPC.
+        state: What the call before returned; None for a cold start.
+        episode_start: Which episodes have just begun, ``(B,)`` or one for all: their plans are forgotten, and
+            ``mpc.usual_input`` stands for inputs of which nothing is known.
+        n_problems: B.
+
+    Raises:
+        InvalidArgumentError: For a state of another MPC or batch size, or starts of another shape.
+    """
+    layout = mpc.layout
+    usual = np.tile(layout.filled(mpc.usual_input), (n_problems, 1)) if layout.n_memory else None
+    if state is None:
+        return Plan.none(n_problems, mpc), usual
+    if len(state) != (2 if usual is None else 3):
+        what = "states and inputs" if usual is None else "states, inputs and past inputs"
+        raise InvalidArgumentError("state", expected=f"what predict returned: {what}", actual=f"{len(state)} arrays")
+    plan = Plan(*state[:2])
+    if len(plan.u) != n_problems:
+        raise InvalidArgumentError(
+            "state", expected=f"the state of {n_problems} environments", actual=f"that of {len(plan.u)}"
+        )
+    started = np.zeros(n_problems, dtype=bool)
+    if episode_start is not None:
+        started = np.asarray(episode_start, dtype=bool)
+        if started.shape not in ((), (n_problems,)):
+            raise InvalidArgumentError(
+                "episode_start", expected=f"shape ({n_problems},)", actual=f"shape {started.shape}"
+            )
+        started = np.broadcast_to(started, (n_problems,))
+    if started.any():  # hardly ever
+        plan = plan.select(~started)
+    if usual is None:
+        return plan, None
+    memory = np.asarray(state[2], dtype=np.float64)
+    if memory.shape != usual.shape:
+        raise InvalidArgumentError(
+            "state", expected=f"past inputs of shape {usual.shape}", actual=f"shape {memory.shape}"
+        )
+    return plan, np.where(started[:, None] | ~np.isfinite(memory), usual, memory)

@@ -1,0 +1,157 @@
+"""The bench of foreign plants: outcomes, the file that is resumed, the counts."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+from functools import partial
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from plant_file import TEXT
+
+from mpcoffline import FileFormatError, OfflineMPCLearner
+from mpcoffline.studies import zoo
+from mpcoffline.studies.zoo import Case, Outcome
+
+ROOT = Path(__file__).parents[2]
+
+
+def outcome(mpc_1: float, learned: float, yardstick: float = np.nan, **more: float | str) -> Outcome:
+    difference = {"gain": learned - mpc_1, "gain_error": 0.1, "short": learned - yardstick, "short_error": 0.1}
+    row = {"plant": "cart", "seed": 0, "starts": 50} | difference | more
+    return Outcome(mpc_1=mpc_1, learned=learned, yardstick=yardstick, **row)  # type: ignore[arg-type]
+
+
+def test_a_case_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cart.py").write_text(TEXT)
+    quick = partial(OfflineMPCLearner, preset="paper", value_n_steps=10, fit_n_steps=5)
+    monkeypatch.setattr(zoo, "OfflineMPCLearner", quick)
+    told: list[str] = []
+    done = zoo.run_case(Case(str(tmp_path / "cart.py"), "cart", 0, 8), told.append)
+    assert done.error == ""
+    assert done.rows > 20
+    assert done.gain == pytest.approx(done.learned - done.mpc_1)
+    assert done.short == pytest.approx(done.learned - done.yardstick)
+    assert done.gain_error > 0.0
+    assert done.fit_s > 0.0
+    assert done.yardstick < done.behaviour
+    assert told[0] == "log"
+    assert "8 episodes of learned" in told
+
+
+def test_an_error_is_a_result(tmp_path: Path) -> None:
+    (tmp_path / "cart.py").write_text(TEXT.replace("    return _mpc(0.5)", "    return 1 / 0"))
+    done = zoo.run_case(Case(str(tmp_path / "cart.py"), "cart", 0, 3))
+    assert done.error == "ZeroDivisionError: division by zero"
+    assert done.mpc_1 > 0.0
+    assert np.isnan(done.learned)
+
+
+def test_differences_are_paired() -> None:
+    costs, others = np.array([1.0, 4.0, 9.0]), np.array([0.0, 2.0, 6.0])
+    assert zoo.paired(costs, others) == (2.0, pytest.approx(1.0 / np.sqrt(3.0)))
+    assert np.isnan(zoo.paired(costs[:1], others[:1])[1])
+
+
+def test_warnings_are_heard(tmp_path: Path) -> None:
+    said: list[str] = []
+    with zoo._heard(said):
+        warnings.warn("first", stacklevel=1)
+        logging.getLogger("mpcoffline.learning").warning("second %d", 2)
+    assert said == ["second 2", "first"]
+
+
+def test_results_survive_a_torn_line(tmp_path: Path) -> None:
+    path = tmp_path / "zoo.csv"
+    assert zoo.read(path) == []
+    first, second = outcome(2.0, 1.0, said="a, b\nc"), outcome(-2.0, np.nan, seed=1, error="no")
+    zoo.append(path, first)
+    whole = path.read_bytes()
+    zoo.append(path, second)
+    lines = path.read_bytes()
+    for size in range(len(whole), len(lines)):  # killed while it wrote the second
+        path.write_bytes(lines[:size])
+        zoo.append(path, outcome(5.0, 5.0, seed=7))
+        seeds = {o.seed for o in zoo.read(path)}
+        assert {0, 7} <= seeds
+    path.write_bytes(lines)
+    zoo.append(path, outcome(-2.0, -3.0, seed=1))  # tried again
+    found = zoo.read(path)
+    assert [(o.seed, o.mpc_1, o.error) for o in found] == [(0, 2.0, ""), (1, -2.0, "")]
+    assert found[0].said == "a, b\nc"
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(FileFormatError, match="other columns"):
+        zoo.read(path)
+
+
+def test_counts_know_no_sign_of_the_cost() -> None:
+    rows = [
+        outcome(100.0, 90.0, 89.0, seed=0),  # better, close, room
+        outcome(100.0, 103.0, 90.0, seed=1),  # worse, far, room
+        outcome(-100.0, -103.0, -104.0, seed=2),  # better, close, room
+        outcome(-100.0, -97.0, -101.0, seed=3),  # worse, close, no room
+        outcome(-100.0, -99.0, seed=4),  # no yardstick
+        outcome(1.0, np.nan, seed=5, gain=np.nan),  # no cost
+        outcome(1.0, 9.0, seed=6, error="x"),
+    ]
+    counts = zoo.summarised(rows)
+    assert counts.cases == 6
+    assert [o.seed for o in counts.worse] == [1, 3, 5]
+    assert (counts.yardsticks, counts.close, counts.room, counts.better) == (4, 3, 3, 2)
+    page = zoo.report(rows)
+    assert "**3 of 6**; cart 1 (+3 +- 0.1); cart 3 (+3 +- 0.1); cart 5" in page
+    assert "**3 of 4**" in page
+    assert "**2 of 3**" in page
+    assert "Failed: cart 6: x" in page
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The script as a module."""
+    monkeypatch.setattr(sys, "prefix", str(ROOT / ".venv"))  # else it would start itself anew there
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    loader = SourceFileLoader("bench_zoo", str(ROOT / "scripts" / "bench_zoo"))
+    spec = spec_from_loader("bench_zoo", loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    loader.exec_module(module)
+    return module
+
+
+def test_the_script_skips_what_is_done_and_what_cannot_be(
+    bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cart.py").write_text(TEXT)
+    (tmp_path / "other.py").write_text("import no_such_package_here\n" + TEXT)
+    out, page = tmp_path / "zoo.csv", tmp_path / "pages" / "zoo.md"
+    zoo.append(out, outcome(2.0, 1.0, 1.0))
+    done: list[Case] = []
+
+    def run_case(case: Case, tell: object) -> Outcome:
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        done.append(case)
+        return outcome(1.0, 2.0, 1.0, seed=case.seed)
+
+    monkeypatch.setattr(bench.zoo, "run_case", run_case)
+    command = ["bench_zoo", str(tmp_path), "--seeds", "0", "1", "2", "--out", str(out), "--table", str(page)]
+    monkeypatch.setattr(sys, "argv", command)
+    assert bench.main() == 130
+    assert [case.seed for case in done] == [1]
+    printed = capsys.readouterr()
+    assert "Left out. other: expected no_such_package_here to be installed" in printed.out
+    assert "2 cases to do; 1 are in" in printed.out
+    assert "what was done is in" in printed.err
+    done.clear()
+    assert bench.main() == 0
+    assert [case.seed for case in done] == [2]
+    assert "**2 of 3**" in page.read_text()
+    monkeypatch.setattr(sys, "argv", [*command, "--plants", "card"])
+    assert bench.main() == 2
+    assert "Did you mean 'cart'" in capsys.readouterr().err
