@@ -114,7 +114,9 @@ def identify(
         check_integers(1, horizon=horizon)
     whole = state_rows(mpc, table)
     rows = plant_rows(mpc, whole)
-    mpc = mpc.replace(model=mpc.model.suited_to_log(rows))
+    mpc = mpc.replace(
+        model=mpc.model.suited_to_log(rows, finer=True)
+    )  # rows may have been left out since it was chosen
     for _ in range(_ROUNDS):
         found = _identified(mpc, rows, config, horizon, seed)
         model = found.model.suited_to_log(rows, finer=True)

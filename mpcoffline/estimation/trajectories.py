@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.scaling import increments_scale, spread_of
 
-from .identification import Rows
+from .identification import ABSURD, Rows
 from .kalman import Linearised
 from .one_step import OneStep
 
@@ -55,10 +56,11 @@ class Trajectories:
         nx = table.ny
         columns = table.values()
         s, reached, spread = columns.observations, columns.next_observations, columns.observations.std(axis=0)
+        unit = spread_of(s)
         difference = _wrapped(reached[:-1] - s[1:], unwrapped)
         within = (table.episode_ids[1:] == table.episode_ids[:-1]) & (columns.terminations[:-1] == 0.0)
         typical = np.median(np.abs(difference[within]), axis=0) if within.any() else np.zeros(nx)
-        size = 1.4826 * typical + 1e-5 * np.where(spread > 0.0, spread, 1.0)
+        size = 1.4826 * typical + 1e-5 * unit
         goes_on = within & (np.sum((difference / size) ** 2, axis=1) <= scipy.stats.chi2(nx).isf(_CUT))
         index, valid = _stretches(goes_on)
         repeated = bool((typical > 1e-6 * spread).any())
@@ -68,7 +70,7 @@ class Trajectories:
             turns[:, :, 0, i] = np.unwrap(s[:, :, i], axis=1) - s[:, :, i]
             turns[:, :, 1, i] = -_FULL_TURN * np.round((reached - s - turns[:, :, 0])[:, :, i] / _FULL_TURN)
         s, reached = s + turns[:, :, 0], reached + turns[:, :, 1]
-        model, scale = OneStep(mpc, mpc.space.mask(("model",))), np.where(spread > 0.0, spread, 1.0)
+        model, scale = OneStep(mpc, mpc.space.mask(("model",))), unit
         return cls(model, scale, spread, repeated, index, valid, s, columns.actions[index], reached, turns)
 
     def thinned(self, rows: int, seed: int) -> Trajectories:
@@ -102,15 +104,16 @@ class Trajectories:
     def linearised(self, theta: Array, about: Array) -> Linearised:
         """The filter's data with the model linearised about states ``(T + 1, E, nx)`` in the filter's units.
 
-        Where the model is not finite, the trajectory is taken to stand still there.
+        Where the model is not finite, or moves by more than 1000 spreads of the increments, the trajectory is taken to
+        stand still.
         """
         steps, n = self.valid.T.shape
         x, u = about[:-1].reshape(-1, len(self.scale)), self.inputs.swapaxes(0, 1).reshape(steps * n, -1)
         ahead, slopes, F = self.model.linearised(x * self.scale, u, theta)
         ahead, slopes, F = ahead / self.scale, slopes / self.scale[:, None], F * self.scale / self.scale[:, None]
-        bad = ~np.isfinite(np.concatenate([part.reshape(len(x), -1) for part in (ahead, slopes, F)], axis=1)).all(
-            axis=1
-        )
+        numbers = np.concatenate([part.reshape(len(x), -1) for part in (ahead, slopes, F)], axis=1)
+        farthest = ABSURD * increments_scale(self.s[self.valid], self.reached[self.valid]) / self.scale
+        bad = ~(np.isfinite(numbers).all(axis=1) & (np.abs(ahead - x) <= farthest).all(axis=1))
         ahead[bad], slopes[bad], F[bad] = x[bad], 0.0, np.eye(len(self.scale))
         parts = (part.reshape(steps, n, *part.shape[1:]) for part in (ahead, F, slopes))
         counts = self.counts if self.repeated else np.minimum(self.counts, 1.0)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
+from mpcoffline.learning.ends import innermost
 from mpcoffline.learning.stages import Arrays, Change
 from mpcoffline.mpc import MPC
 
@@ -107,9 +108,10 @@ class Run:
 
     def _prepared(self) -> Known:
         """What the stages begin with: past inputs beside the observations where the MPC holds some, then trimmed."""
-        known = self.method.prepared(replace(self._start, mpc=self._mpc))
+        known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
         table = with_memory(known.table, known.mpc.layout)
-        return replace(known, table=table.trim(self.method.trim, known.mpc.ny))
+        n = known.mpc.layout.n_states
+        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n))
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

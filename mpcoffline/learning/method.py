@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
@@ -44,7 +45,10 @@ class Method(ABC):
         discount: gamma of V and of the learned MPC; None keeps the given MPC's.
         least_discount: Where ``discount`` is None and the given MPC's is smaller, this is taken: a small discount hides
             goals that are far. A linear-quadratic MPC, which sees any distance, keeps its own.
-        horizon: N of the learned MPC; None keeps the given one's.
+        horizon: N of the learned MPC; None keeps the given one's, or what ``least_horizon`` makes of it.
+        least_horizon: Where ``horizon`` is None, a horizon that leaves more to V, and is faster: this one at
+            ``least_discount``, and where the discount is larger as many steps as it takes for gamma^N to fall as low,
+            but no more than the given MPC has.
         cross_term: Whether the quadratic stage cost gets a cross term S.
     """
 
@@ -52,6 +56,7 @@ class Method(ABC):
     discount: float | None = None
     least_discount: float = 0.0
     horizon: int | None = None
+    least_horizon: int | None = None
     cross_term: bool = False
 
     def __post_init__(self) -> None:
@@ -61,6 +66,8 @@ class Method(ABC):
         check_number("least_discount", self.least_discount, 0.0, 1.0, open_low=False)
         if self.horizon is not None:
             check_integers(1, horizon=self.horizon)
+        if self.least_horizon is not None:
+            check_integers(1, least_horizon=self.least_horizon)
 
     @abstractmethod
     def stages(self) -> dict[str, Stage | Change]:
@@ -148,17 +155,27 @@ class Method(ABC):
         """The MPC with the discount, the horizon and the form of stage cost that the options ask for."""
         least = 0.0 if is_linear_quadratic(nominal) else self.least_discount
         discount = max(nominal.discount, least) if self.discount is None else self.discount
-        horizon = nominal.horizon if self.horizon is None else self.horizon
-        mpc = nominal.replace(discount=discount, horizon=horizon)
+        mpc = nominal.replace(discount=discount, horizon=self._horizon(nominal.horizon, discount))
         cost = nominal.stage_cost
         if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
             values, cross = cost.values, np.zeros((cost.nx, cost.nu))
             constant = float(values["constant"])
-            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant, values.get("D"))
+            references = values["x_ref"], values["u_ref"]
+            D = values.get("D")
+            crossed = QuadraticCost(cost.W, cost.R, cross, *references, constant, D=D, tracks=cost.tracks)
             return mpc.replace(stage_cost=crossed)
         if self.cross_term:
             _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")
         return mpc
+
+    def _horizon(self, given: int, discount: float) -> int:
+        """N of the learned MPC."""
+        if self.horizon is not None or self.least_horizon is None:
+            return given if self.horizon is None else self.horizon
+        if not 0.0 < self.least_discount < discount < 1.0:
+            return self.least_horizon if discount < 1.0 else max(given, self.least_horizon)
+        alike = self.least_horizon * math.log(self.least_discount) / math.log(discount)
+        return max(self.least_horizon, min(given, math.ceil(alike)))
 
 
 def _described(option: Any) -> Any:

@@ -98,6 +98,7 @@ class Known:
     Attributes:
         mpc: The MPC with what is learned of it so far.
         table: The transitions, without what was taken out of them so far.
+        given: MPC_1, of which the method may have changed horizon and discount.
         groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
         seed: Seeds everything.
         device: Torch device for what is large.
@@ -120,6 +121,7 @@ class Known:
     model_error: float | None = None
     residual_share: float | None = None
     result: FitResult | None = None
+    given: MPC | None = None
 
     @property
     def constant_value(self) -> ValueFunction:

@@ -78,6 +78,19 @@ def test_horizons_are_those_of_the_preset() -> None:
     assert horizons["fast"] <= 10 < horizons["default"] <= horizons["best"]
 
 
+@pytest.mark.parametrize(
+    ("discount", "given", "horizon"),
+    # .95^30 = .2146; .995^307 = .2146, .97^51 = .2115, .97^50 = .2181
+    [(0.95, 100, 30), (0.9, 200, 30), (0.97, 20, 30), (0.97, 40, 40), (0.97, 200, 51), (0.995, 200, 200)],
+)
+def test_a_horizon_is_shortened_as_far_as_the_discount_allows(discount: float, given: int, horizon: int) -> None:
+    """The terminal cost weighs no more than in the study, whatever the sampling time."""
+    mpc = make_mpc().replace(discount=discount, horizon=given)
+    assert PRESETS["default"].restructured(mpc).horizon == horizon
+    assert PRESETS["default"].replaced({"horizon": 7}).restructured(mpc).horizon == 7
+    assert PRESETS["paper"].restructured(mpc).horizon == given
+
+
 def test_a_cross_term_leaves_the_cost_as_it_is_until_it_is_fitted() -> None:
     mpc = make_mpc()
     crossed = Paper(cross_term=True).restructured(mpc)

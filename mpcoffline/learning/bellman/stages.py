@@ -7,12 +7,17 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 
 from mpcoffline.core.checks import check_known, check_number
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residual, identify, with_residual
+from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
+from mpcoffline.learning.ends import ends_matter, priced_ends
 from mpcoffline.learning.linear_quadratic import riccati_cost
+from mpcoffline.learning.potential import Potential
 from mpcoffline.learning.stages import Known, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
@@ -40,17 +45,35 @@ class StartConfig:
         adapt_above: With ``init="identified"``, steps on cost and model together (``fit_n_steps``) are made only where
             the identified model misses more than this share of an increment (root mean square of the one-step
             errors): where its structure is not the plant's. Else the model stays and the cost alone is fitted.
+        delays: With ``init="identified"``, whether dead time is looked for in the data before all else, where the model
+            says nothing of it (``delay=None``), and checked where it does.
         residual: With ``init="identified"``, whether a model that misses more than that gets a learned residual, if
             held-out episodes ask for one (:func:`mpcoffline.estimation.fit_residual`); it stays then, too.
     """
 
     init: Init = "nominal"
     adapt_above: float = 0.0
+    delays: bool = True
     residual: bool = False
 
     def __post_init__(self) -> None:
         check_known("init", self.init, get_args(Init))
         check_number("adapt_above", self.adapt_above, 0.0, open_low=False)
+
+
+def with_dead_time(known: Known, config: StartConfig) -> Known:
+    """The MPC with the dead time that the log shows, where its model says none; where it does, a check of that."""
+    if config.init == "nominal" or not config.delays or known.value_function is not None:
+        return known
+    model, search = known.mpc.model, find_delays(known.mpc, known.table, seed=known.seed)
+    if not search.found:
+        _log.info("Inputs: %s", search)
+    elif model.delay is None:
+        _log.warning("Inputs act late: found a %s. The learned MPC carries the past inputs.", search)
+        return replace(known, mpc=known.mpc.with_delay(search.delay))
+    else:
+        _log.warning("The model's delay is %s, the log says otherwise: a %s.", list(model.delay), search)
+    return known
 
 
 def identified(known: Known, config: StartConfig) -> Known:
@@ -112,12 +135,16 @@ class LearnParameters(Stage):
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
         mpc = known.mpc if known.cost is not None else in_units_of(known.mpc, known.table)
-        value, config = known.constant_value, self._adapting(0.0 if known.residual_share else known.model_error)
-        return ParameterTraining(mpc, value, known.table, known.groups, config, seed=known.seed, cost=known.cost)
+        value, config, table = known.constant_value, self._adapting(known), known.table
+        if known.cost is None and ends_matter(table, mpc.discount):  # of which T knows; no stage cost explains them
+            table = table.take(np.flatnonzero(np.asarray(table.terminations) == 0.0))
+        return ParameterTraining(mpc, value, table, known.groups, config, seed=known.seed, cost=known.cost)
 
-    def _adapting(self, missed: float | None) -> ParameterConfig:
-        """The configuration, without steps on a model that was identified and predicts well."""
-        config = self._config
+    def _adapting(self, known: Known) -> ParameterConfig:
+        """The configuration, without steps on a model that was identified and predicts well, or has the right cost."""
+        config, missed = self._config, 0.0 if known.residual_share else known.model_error
+        if known.cost is not None and (known.cost.constant or missed is not None):
+            return replace(config, n_steps=0)
         if missed is None or not config.n_steps:
             return config
         if missed <= self._adapt_above:
@@ -157,13 +184,18 @@ class TerminalConfig:
         check_number("blend", self.blend, 0.0, 1.0, open_low=False)
 
 
-def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
+def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | None = None) -> Known:
     """The MPC with the terminal cost that is asked for: T = V - Phi, or none from V.
 
-    The exact value of an MPC is V - Phi of its own: Phi changes none of its inputs.
+    The exact value of an MPC is V - Phi of its own: Phi changes none of its inputs. Where all logged costs are one
+    number, V is in no unit of the stage cost: then the given terminal cost stays, and with it the given horizon, unless
+    one was asked for (``horizon``).
     """
     if config.method == "given":
         return known
+    if known.cost is not None and known.cost.constant:
+        mpc = known.mpc if horizon is not None or known.given is None else _as_far_as(known.given, known.mpc)
+        return replace(known, mpc=mpc)
     goal = settled(known.mpc, known.table)
     exact = riccati_cost(known.mpc) if config.method == "auto" else None
     cost: TerminalCost = NormCost(goal) if exact is None else exact
@@ -179,9 +211,24 @@ def with_terminal_cost(known: Known, config: TerminalConfig) -> Known:
             x_ref=goal,
             blend=config.blend,
             seed=known.seed,
+            ends=_ends(known, potential),
         )
     mpc = known.mpc.replace(terminal_cost=cost)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
+
+
+def _as_far_as(given: MPC, mpc: MPC) -> MPC:
+    """The MPC with the given one's horizon and discount."""
+    return mpc.replace(horizon=given.horizon, discount=given.discount)
+
+
+def _ends(known: Known, potential: Potential | None) -> tuple[Array, Array] | None:
+    """Where episodes end at a price, and T there; with Phi, ``Lhat + Phi(s) + gamma T(s+) = L``."""
+    ends = priced_ends(known.mpc, known.table, known.cost)
+    if ends is None:
+        return None
+    shaping = 0.0 if potential is None else potential(torch.from_numpy(ends.before)).numpy() / known.mpc.discount
+    return ends.states, np.asarray(ends.values - shaping)
 
 
 def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:

@@ -11,6 +11,10 @@ from mpcoffline.core.checks import check_integers, check_known, check_number
 
 from .methods import VALUE_METHODS, ValueMethod, check_tau, method_from_json, method_to_json
 
+SWEEPS = 3.0  # times 1 / (1 - gamma): how often the target must have followed
+_LEAST_SWEEPS = 1.5  # the same for a rate that is not given: a faster one costs stability
+_POLYAK = (0.02, 0.2)  # the slowest and the fastest of a rate that is not given
+
 
 @dataclass(frozen=True)
 class ValueConfig:
@@ -24,7 +28,8 @@ class ValueConfig:
         n_steps: Gradient steps.
         batch_size: Transitions a step.
         learning_rate: Adam's at the start; falls to zero on a cosine.
-        polyak: Rate at which the target network follows.
+        polyak: Rate at which the target network follows; None for 0.02, or faster where V would not settle in
+            ``n_steps`` at the discount (:meth:`rate`), up to 0.2.
         hidden: Widths of the hidden layers.
         n_members: Networks that are learned, from different initial weights; V is their mean.
         validation: Share of the episodes that is held out; the weights with the smallest loss on them are kept. With
@@ -37,7 +42,7 @@ class ValueConfig:
     n_steps: int = 8_000
     batch_size: int = 256
     learning_rate: float = 1e-3
-    polyak: float = 0.01
+    polyak: float | None = 0.01
     hidden: tuple[int, ...] = (256, 256)
     n_members: int = 1
     validation: float = 0.0
@@ -51,8 +56,25 @@ class ValueConfig:
         check_integers(1, **{f"hidden[{i}]": width for i, width in enumerate(self.hidden)})
         check_integers(0, patience=self.patience)
         check_number("learning_rate", self.learning_rate, 0.0)
-        check_number("polyak", self.polyak, 0.0, 1.0)
+        if self.polyak is not None:
+            check_number("polyak", self.polyak, 0.0, 1.0)
         check_number("validation", self.validation, 0.0, 0.9, open_low=False)
+
+    def rate(self, discount: float) -> float:
+        """The rate at which the target network follows.
+
+        The values that it holds travel back one step each time that it has followed: they have settled after some
+        ``1 / (1 - gamma)`` times.
+        """
+        if self.polyak is not None:
+            return self.polyak
+        needed = _LEAST_SWEEPS / max(self.n_steps * (1.0 - discount), 1e-12)
+        return min(max(needed, _POLYAK[0]), _POLYAK[1])
+
+    def settles(self, discount: float) -> bool:
+        """Whether the target follows often enough."""
+        sweeps = self.rate(discount) * self.n_steps * (1.0 - discount)
+        return sweeps >= (1.0 - 1e-9) * (_LEAST_SWEEPS if self.polyak is None else SWEEPS)
 
     def build(self, *, noisy: bool = False) -> ValueMethod:
         """The loss.

@@ -45,9 +45,9 @@ def estimate_stochasticity(table: TransitionTable, *, seed: int = 0) -> Stochast
 
         share = Var[y - E(y | s, a)] / Var[y],       y = s+ - s per coordinate, or L
 
-    with E(y | s, a) from ridge regression on products and random features tanh(w'(s, a) + b) of one half of (at most
-    20,000) rows, and the variances of the other half. What the features cannot express counts as noise: under 1 % of
-    the variance on the tasks that ship.
+    where no episode ends, with E(y | s, a) from ridge regression on products and random features tanh(w'(s, a) + b) of
+    one half of (at most 20,000) rows, and the variances of the other half. What the features cannot express counts as
+    noise: under 1 % of the variance on the tasks that ship.
 
     Args:
         table: The transitions.
@@ -58,6 +58,7 @@ def estimate_stochasticity(table: TransitionTable, *, seed: int = 0) -> Stochast
     """
     rng = np.random.default_rng(seed)
     rows = next(table.batches(_MAX_ROWS, rng, epochs=1)).numpy().astype(np.float64)
+    rows = rows[rows[:, -1] == 0.0]  # what it costs that an episode ends is no noise
     sample = table.columns(rows)
     x = np.hstack([sample.observations, sample.actions])
     y = np.column_stack([sample.next_observations - sample.observations, sample.costs])

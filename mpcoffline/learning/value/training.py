@@ -15,7 +15,7 @@ from torch import Tensor
 from mpcoffline.core.errors import FileFormatError, MPCOfflineError
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 
-from .config import ValueConfig, cosine
+from .config import SWEEPS, ValueConfig, cosine
 from .function import ValueFunction, tanh_network
 from .methods import Residual, ValueMethod
 from .network import Member, same_shape, whole_numbers
@@ -25,7 +25,6 @@ from .units import Units
 VALIDATE_EVERY = 250  # steps
 _VALIDATION_ROWS = 8_192
 _LOST = 25  # steps in a row without a finite gradient
-_SWEEPS = 3.0  # times 1 / (1 - gamma): how often the target must have followed
 
 _log = logging.getLogger(__name__)
 
@@ -164,9 +163,8 @@ class ValueTraining:
         """One step of each member; returns the losses that were finite."""
         config, batch = self._config, self._batch(next(self._batches))
         learning_rate = config.learning_rate * cosine(self.step, self.n_steps)
-        losses = [
-            member.descend(self.method, batch, self._discount, learning_rate, config.polyak) for member in self._members
-        ]
+        polyak = config.rate(self._discount)
+        losses = [member.descend(self.method, batch, self._discount, learning_rate, polyak) for member in self._members]
         finite = [loss for loss in losses if math.isfinite(loss)]
         self._skipped = 0 if len(finite) == len(losses) else self._skipped + 1
         if self._skipped == 1:
@@ -209,13 +207,13 @@ def _tell(method: ValueMethod, found: Stochasticity | None, config: ValueConfig,
             100.0 * found.change,
             100.0 * found.cost,
         )
-    sweeps = config.polyak * config.n_steps * (1.0 - discount)
-    if sweeps < _SWEEPS * (1.0 - 1e-9) and discount < 1.0 and not isinstance(method, Residual):
+    polyak = config.rate(discount)
+    if not config.settles(discount) and discount < 1.0 and not isinstance(method, Residual):
         _log.warning(
             "(VALUE) may end before V has settled: polyak * n_steps * (1 - discount) is %.2g, below %g; raise n_steps "
             "(%d) or polyak (%g)",
-            sweeps,
-            _SWEEPS,
+            polyak * config.n_steps * (1.0 - discount),
+            SWEEPS,
             config.n_steps,
-            config.polyak,
+            polyak,
         )

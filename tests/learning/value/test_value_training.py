@@ -298,5 +298,15 @@ def test_a_schedule_too_short_for_the_discount_is_told(caplog: pytest.LogCapture
     assert "raise n_steps (8000) or polyak (0.01)" in caplog.text
     caplog.clear()
     ValueTraining(lq_plant.random_log(50), 0.9, ValueConfig(method="td"), seed=0)
+    ValueTraining(lq_plant.random_log(50), 0.99, ValueConfig(method="td", polyak=None), seed=0)
     ValueTraining(lq_plant.random_log(50), 0.99, ValueConfig(), seed=0)  # the residual has no target
     assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("n_steps", "discount", "rate"), [(3_000, 0.95, 0.02), (3_000, 0.97, 0.02), (3_000, 0.99, 0.05), (100, 0.99, 0.2)]
+)
+def test_a_rate_that_is_not_given_lets_v_settle(n_steps: int, discount: float, rate: float) -> None:
+    """One and a half times the effective horizon, 1 / (1 - gamma), in n_steps; between 0.02 and 0.2."""
+    assert ValueConfig(n_steps=n_steps, polyak=None).rate(discount) == pytest.approx(rate, rel=1e-6)
+    assert ValueConfig(n_steps=n_steps, polyak=0.5).rate(discount) == 0.5
