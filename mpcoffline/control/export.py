@@ -38,7 +38,8 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
     ``mpc_controller.h`` declares ``mpc_step(parameters, state, y, u)`` and documents every parameter with its unit;
     ``mpc_controller.c`` solves with the algorithm of the ddp solver, one problem at a time and within a fixed number of
     iterations; the warm start lives in ``mpc_state``, theta in ``mpc_parameters``. ``mpc_test.c`` replays
-    ``test_vectors.txt``, closed loops of the policy on its own model.
+    ``test_vectors.txt``, closed loops of the policy on its own model. y is the observation; past inputs that the MPC's
+    state holds besides are kept in ``mpc_state``.
 
     Args:
         policy: The policy, or the file of one or of a learner.
@@ -86,6 +87,7 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
     bounds = [f" *   u[{a}]: from {low[a]:g} to {high[a]:g}" for a in range(mpc.nu)]
     replaced = {
         "NX": str(mpc.nx),
+        "NY": str(mpc.ny),
         "NU": str(mpc.nu),
         "NP": str(mpc.space.size),
         "HORIZON": str(mpc.horizon),
@@ -115,6 +117,9 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
         _array("high", mpc.action_high),
         _array("unit", input_units(mpc)),
         _array("candidates", segments),
+        "/* What counts as applied before the first step; where each past input comes from: past inputs, then u. */",
+        _array("usual", np.append(mpc.layout.filled(mpc.usual_input), 0.0)),
+        f"static const int sources[] = {{{', '.join(map(str, [*(mpc.layout.sources - mpc.ny), 0]))}}};",
         "const mpc_parameters mpc_learned_parameters = {\n" + "\n".join(values) + "\n};",
         "/* mpc_parameters is nothing but MPC_NP numbers: the size of this array is negative if it were not. */",
         "typedef char mpc_parameters_are_numbers[sizeof(mpc_parameters) == MPC_NP * sizeof(double) ? 1 : -1];",
@@ -128,14 +133,14 @@ def _vectors(policy: MPCPolicy) -> list[list[float]]:
     mpc = policy.mpc
     rows: list[list[float]] = []
     for start in _unambiguous_starts(policy):
-        y, state = start, None
+        z, state = start, None
         for step in range(_STEPS):
-            solution = policy.solver.solve(y, warm_start=state)
+            solution = policy.solver.solve(z, warm_start=state)
             if not solution.success:  # its action would say nothing
                 break
             state = solution.plan.shifted()
-            rows.append([float(step == 0), *y.tolist(), *solution.u0.tolist()])
-            y = mpc.model(y, solution.u0)
+            rows.append([float(step == 0), *z[: mpc.ny].tolist(), *solution.u0.tolist()])
+            z = mpc.model(z, solution.u0)
     if not rows:
         _log.warning(
             "No test vectors: of %d starts each was unsolved or had plans that are as good as its own.",
@@ -161,13 +166,14 @@ def _unambiguous_starts(policy: MPCPolicy) -> list[Array]:
     rng, shaking = np.random.default_rng(0), np.random.default_rng(1)
     found: list[Array] = []
     width = np.asarray(policy.mpc.action_high) - np.asarray(policy.mpc.action_low)
-    centre, low, high = _reached(policy.mpc)
+    (centre, low, high), mpc = _reached(policy.mpc), policy.mpc
     for size in _SIZES:
-        draws = centre + size * (rng.uniform(low, high, (_DRAWS, policy.mpc.nx)) - centre)
+        draws = mpc.state(centre + size * (rng.uniform(low, high, (_DRAWS, mpc.ny)) - centre))
         solved = policy.solver.solve(draws)
         alike = _ALIKE * float(np.ptp(solved.value[solved.success])) if solved.success.any() else 0.0
         for y, plan, value in zip(*(a[solved.success] for a in (draws, solved.u, solved.value)), strict=True):
-            nearby = y + size * _NEARBY * (high - low) * shaking.uniform(-0.5, 0.5, (_NEIGHBOURS, len(y)))
+            moved = size * _NEARBY * (high - low) * shaking.uniform(-0.5, 0.5, (_NEIGHBOURS, mpc.ny))
+            nearby = y + np.pad(moved, ((0, 0), (0, mpc.nx - mpc.ny)))
             others = policy.solver.solve(np.tile(y, (_NEIGHBOURS, 1)), warm_start=policy.solver.solve(nearby).plan)
             rivals = others.u[others.value < value + alike]
             same = _SAME_PLAN * np.where(np.isfinite(width), width, np.abs(plan).max())
@@ -184,11 +190,11 @@ def _reached(mpc: MPC) -> tuple[Array, Array, Array]:
     That is the middle half of what an episode reaches from there, widened to twice its size; so it is in the plant's
     own units.
     """
-    inputs, centre = starts.candidate_inputs(mpc), np.zeros(mpc.nx) if mpc.reference is None else mpc.reference
-    states = [np.broadcast_to(centre, (len(inputs), mpc.nx))]
+    inputs, centre = starts.candidate_inputs(mpc), np.zeros(mpc.ny) if mpc.reference is None else mpc.reference
+    states = [mpc.state(np.broadcast_to(centre, (len(inputs), mpc.ny)))]
     for k in range(min(_STEPS, mpc.horizon)):
         states.append(mpc.model(states[-1], inputs[:, k]))
-    reached = np.concatenate(states)
+    reached = np.concatenate(states)[:, : mpc.ny]
     low, high = np.quantile(reached[np.isfinite(reached).all(axis=1)], [0.25, 0.75], axis=0)
     return centre, low - (high - low) / 2, high + (high - low) / 2
 
@@ -210,8 +216,10 @@ _HEADER = """\
  *   mpc_reset(&state);
  *   every @DT@ s:  mpc_step(&mpc_learned_parameters, &state, y, u);
  *
- * y: the policy's observation (the MPC's state), @NX@ numbers. u: the action, @NU@ numbers:
+ * y: the policy's observation, @NY@ numbers. u: the action, @NU@ numbers:
 @BOUNDS@
+ * Past inputs that the MPC needs besides (dead time, prices on changes) are kept in mpc_state: those that mpc_step
+ * returned, so apply them as they are.
  *
  * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
  * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a
@@ -224,6 +232,7 @@ _HEADER = """\
 extern "C" {
 #endif
 
+#define MPC_NY @NY@
 #define MPC_NX @NX@
 #define MPC_NU @NU@
 #define MPC_NP @NP@
@@ -238,9 +247,10 @@ typedef struct {
 
 extern const mpc_parameters mpc_learned_parameters;
 
-/* The plan from which the next step starts, and work space. */
+/* The plan from which the next step starts, past inputs, and work space. */
 typedef struct {
     int has_plan;
+    double past[MPC_NX - MPC_NY + 1];
     double x[(MPC_HORIZON + 1) * MPC_NX], u[MPC_HORIZON * MPC_NU];
     double old_x[(MPC_HORIZON + 1) * MPC_NX], old_u[MPC_HORIZON * MPC_NU];
     double work_x[(MPC_HORIZON + 1) * MPC_NX], work_u[MPC_HORIZON * MPC_NU];
@@ -248,7 +258,7 @@ typedef struct {
     double work_k[MPC_HORIZON * MPC_NU], work_K[MPC_HORIZON * MPC_NU * MPC_NX];
 } mpc_state;
 
-/* Forgets the plan: call it before the first step and when an episode begins. */
+/* Forgets the plan and the past inputs: call it before the first step and when an episode begins. */
 void mpc_reset(mpc_state *state);
 
 /* The action u for the observation y, always within its bounds. Returns where it comes from:
@@ -256,7 +266,7 @@ void mpc_reset(mpc_state *state);
  *   1  it was not; the best plan that was found is applied: the model run with inputs within their bounds;
  *   2  no plan was found that is finite: the next input of the plan before;
  *   3  nor was there one before: zero, within the bounds. */
-int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NX], double u[MPC_NU]);
+int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NY], double u[MPC_NU]);
 
 #ifdef __cplusplus
 }
@@ -274,7 +284,7 @@ _TEST = """\
 
 int main(int argc, char **argv) {
     static mpc_state state;
-    double y[MPC_NX], u[MPC_NU], expected, worst = 0.0;
+    double y[MPC_NY], u[MPC_NU], expected, worst = 0.0;
     const double range[MPC_NU] = {@RANGES@};
     int reset, steps = 0, unsolved = 0;
     FILE *file = fopen(argc > 1 ? argv[1] : "test_vectors.txt", "r");
@@ -283,7 +293,7 @@ int main(int argc, char **argv) {
         return 2;
     }
     while (fscanf(file, "%d", &reset) == 1) {
-        for (int i = 0; i < MPC_NX; ++i)
+        for (int i = 0; i < MPC_NY; ++i)
             if (fscanf(file, "%lf", &y[i]) != 1) return 2;
         if (reset) mpc_reset(&state);
         unsolved += mpc_step(&mpc_learned_parameters, &state, y, u) != 0;

@@ -17,7 +17,7 @@ from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates
-from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale
+from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale, spread_of
 
 _ROWS = 10_000
 _TREE_ROWS = 5_000
@@ -172,8 +172,7 @@ def outside_support(table: TransitionTable, states: Array) -> float:
     By the distance to the nearest logged state, coordinates in spreads of the data.
     """
     sample = table.sample(2 * _TREE_ROWS, 1)
-    spread = sample.observations.std(axis=0)
-    scale = np.where(spread > 0.0, spread, 1.0).astype(np.float64)
+    scale = spread_of(sample.observations)
     order = np.random.default_rng(0).permutation(len(sample))
     half = max(1, len(sample) // 2)
     known, others = (sample.observations[order[part]] / scale for part in (slice(None, half), slice(half, None)))
@@ -246,9 +245,7 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
 def goal_share(table: TransitionTable, reference: Array) -> float:
     """Share of the logged states within a quarter of the data's spread of the reference, in every coordinate."""
     states = table.observations[:, : len(reference)]
-    spread = states.std(axis=0)
-    scale = np.where(spread > 0.0, spread, 1.0)
-    return float(np.mean((np.abs(states - reference) < _NEAR * scale).all(axis=1)))
+    return float(np.mean((np.abs(states - reference) < _NEAR * spread_of(states)).all(axis=1)))
 
 
 def bound_names(mpc: MPC, nominal: MPC, table: TransitionTable) -> tuple[str, ...]:

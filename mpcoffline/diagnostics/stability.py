@@ -10,6 +10,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC, QuadraticCost
+from mpcoffline.mpc.scaling import spread_of
 from mpcoffline.solvers import Solver
 
 _NEIGHBOURS = 100
@@ -54,7 +55,7 @@ def value_growth(value: ValueFunction, table: TransitionTable, states: Array, lo
     if lost or not np.isfinite(states).all():
         return np.inf
     logged = value.predict(table.take(slice(None, None, max(1, len(table) // 10_000))).observations)
-    return float((value.predict(states).max() - logged.min()) / max(float(np.ptp(logged)), 1e-12))
+    return float((value.predict(states).max() - logged.min()) / (float(np.ptp(logged)) or np.inf))
 
 
 def closed_loop_eigenvalues(mpc: MPC, solver: Solver, table: TransitionTable, reference: Array) -> tuple[float, ...]:
@@ -64,7 +65,7 @@ def closed_loop_eigenvalues(mpc: MPC, solver: Solver, table: TransitionTable, re
     that the plant never takes.
     """
     s = table.observations.astype(np.float64)
-    spread = np.where(s.std(axis=0) > 0.0, s.std(axis=0), 1.0)
+    spread = spread_of(s)
     step = _STEP * spread
     moved = reference + np.concatenate([np.diag(step), -np.diag(step)])
     found = solver.solve(np.concatenate([reference[None], moved]))

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.mpc.scaling import spread_of
 
 _RIDGE = 1e-7  # relative to the mean square of the features
 
@@ -31,8 +32,7 @@ class RandomFeatures:
         multiplied: int | None = None,
         flattest: float = 1.0,
     ) -> None:
-        self._mean, spread = x.mean(axis=0), x.std(axis=0)
-        self._spread = np.where(spread > 0.0, spread, 1.0)
+        self._mean, self._spread = x.mean(axis=0), spread_of(x)
         self._directions = rng.standard_normal((x.shape[1], n_random))
         if flattest < 1.0:
             self._directions *= rng.uniform(flattest, 1.0, n_random)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.scaling import spread_of
 
 from .identification import Rows
 from .kalman import Linearised
@@ -55,10 +56,11 @@ class Trajectories:
         nx = table.ny
         columns = table.values()
         s, reached, spread = columns.observations, columns.next_observations, columns.observations.std(axis=0)
+        unit = spread_of(s)
         difference = _wrapped(reached[:-1] - s[1:], unwrapped)
         within = (table.episode_ids[1:] == table.episode_ids[:-1]) & (columns.terminations[:-1] == 0.0)
         typical = np.median(np.abs(difference[within]), axis=0) if within.any() else np.zeros(nx)
-        size = 1.4826 * typical + 1e-5 * np.where(spread > 0.0, spread, 1.0)
+        size = 1.4826 * typical + 1e-5 * unit
         goes_on = within & (np.sum((difference / size) ** 2, axis=1) <= scipy.stats.chi2(nx).isf(_CUT))
         index, valid = _stretches(goes_on)
         repeated = bool((typical > 1e-6 * spread).any())
@@ -68,7 +70,7 @@ class Trajectories:
             turns[:, :, 0, i] = np.unwrap(s[:, :, i], axis=1) - s[:, :, i]
             turns[:, :, 1, i] = -_FULL_TURN * np.round((reached - s - turns[:, :, 0])[:, :, i] / _FULL_TURN)
         s, reached = s + turns[:, :, 0], reached + turns[:, :, 1]
-        model, scale = OneStep(mpc, mpc.space.mask(("model",))), np.where(spread > 0.0, spread, 1.0)
+        model, scale = OneStep(mpc, mpc.space.mask(("model",))), unit
         return cls(model, scale, spread, repeated, index, valid, s, columns.actions[index], reached, turns)
 
     def thinned(self, rows: int, seed: int) -> Trajectories:

@@ -126,6 +126,8 @@ class OfflineMPCLearner:
     def __repr__(self) -> str:
         """What it learns, how, and whether it has."""
         state = "fitted" if self.result is not None else "not fitted"
+        if isinstance(self._mpc, MPC) and any(self._mpc.layout.delay):
+            state += f", dead time {list(self._mpc.layout.delay)}"
         how = f"method={type(self.method).__name__}" if self.preset is None else f"preset={self.preset!r}"
         return f"{type(self).__name__}(learn={self.learn!r}, {how}, seed={self.seed}; {state})"
 

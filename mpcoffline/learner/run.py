@@ -108,10 +108,9 @@ class Run:
 
     def _prepared(self) -> Known:
         """What the stages begin with: past inputs beside the observations where the MPC holds some, then trimmed."""
-        known = self.method.prepared(replace(self._start, mpc=self._mpc))
+        known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
         table = with_memory(known.table, known.mpc.layout)
-        table = innermost(table, self.method.trim, known.mpc.discount, known.mpc.ny)
-        return replace(known, table=table, given=self._start.mpc)
+        return replace(known, table=innermost(table, self.method.trim, self._mpc.discount, known.mpc.ny))
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

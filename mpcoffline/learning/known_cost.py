@@ -17,7 +17,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
 from mpcoffline.mpc.scaling import Scaling
 
 from .stages import Known, KnownCost
@@ -59,7 +59,7 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     """What is known of the stage cost, from the rows as they were logged: smoothed ones would blur it."""
     if config.stage_cost == "fitted":
         return known
-    rows = excerpt(known.table, known.seed)
+    rows = _excerpt(known.table, known.seed)
     found = known_cost(known.mpc, rows)
     if found is None and config.stage_cost == "auto":
         other = _with_fitted_weights(known.mpc, rows)
@@ -78,13 +78,11 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
             100.0 * found.agreeing,
         )
     if found.constant:
-        _log.warning(
-            "%s: all costs are %g, so they do not tell what is good%s; stage and terminal cost stay the given ones, and "
-            "the model is learned",
-            known.table.name,
-            found.offset,
-            ", but that episodes should not end, or should" if np.any(known.table.terminations) else "",
-        )
+        says = "all costs are %g, so they do not tell what is good"
+        if np.asarray(known.table.terminations).any():
+            says = "the costs are %g until an episode ends: they say when that is, but not what is better before"
+        kept = "; stage and terminal cost stay the given ones, and the model is learned"
+        _log.warning("%s: " + says + kept, known.table.name, found.offset)
     return replace(known, cost=found)
 
 
@@ -210,14 +208,19 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     def full(z: Array) -> Array:
         return np.asarray(coordinates.theta(torch.from_numpy(np.asarray(z))).numpy())
 
+    def missed(theta: Array) -> Array:
+        return np.asarray(logged - mpc.stage_function(s, a, theta).full().ravel())
+
     def residuals(z: Array) -> Array:
-        missed = (mpc.stage_function(s, a, full(z)).full().ravel() - logged) / size
-        return np.asarray(np.nan_to_num(missed, nan=1e6, posinf=1e6, neginf=-1e6))
+        """With the best constant for every z."""
+        errors = -missed(full(z)) / size
+        return np.asarray(np.nan_to_num(errors - errors.mean(), nan=1e6, posinf=1e6, neginf=-1e6))
 
     def jacobian(z: Array) -> Array:
         values = full(z)
         change = np.where(coordinates.logarithmic, values[coordinates.mask], coordinates.scale)
-        return np.asarray(np.nan_to_num(slopes(s, a, values).full()[coordinates.mask].T * change / size))
+        rates = slopes(s, a, values).full()[coordinates.mask].T * change / size
+        return np.asarray(np.nan_to_num(rates - rates.mean(axis=0)))
 
     low, high = np.minimum(coordinates.low, -1e-9), np.maximum(coordinates.high, 1e-9)
     found = scipy.optimize.least_squares(
@@ -225,10 +228,11 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     )
     if not np.mean(found.fun**2) <= _EXACT:
         return None
-    return mpc.with_theta(canonical(mpc, full(found.x)))
+    fitted = canonical(mpc, full(found.x))
+    return mpc.with_theta(with_level(mpc, fitted, float(missed(fitted).mean())))
 
 
-def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
+def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
     """The table, or of a large one some stretches of consecutive rows."""
     n_blocks, wanted = -(-len(table) // _BLOCK), _ROWS // _BLOCK
     if n_blocks <= wanted:

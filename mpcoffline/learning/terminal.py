@@ -22,6 +22,7 @@ from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOf
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import NetworkCost, QuadraticCost, TerminalCost
 from mpcoffline.mpc.networks import HIDDEN
+from mpcoffline.mpc.scaling import spread_of
 
 from .distillation import fit_network
 
@@ -32,6 +33,7 @@ TERMINAL_KINDS = ("quadratic", "network")
 
 _FLAT = 1e-6  # relative spread below which a coordinate counts as constant, in float32
 _FLAT_DOUBLE = 1e-12  # the same where states have the digits of float64
+_ROUNDINGS = 8.0  # of the largest V: a spread below is none
 _ENDS = 0.05  # least share of the states where episodes end, which are few
 _MAX_ERROR = 0.5  # of the spread of V: what is worse than this has learned nothing
 
@@ -131,20 +133,19 @@ def fit_terminal(
     states = _states(observations, len(reference))
     rng = np.random.default_rng(seed)
     states = states[np.sort(rng.permutation(len(states))[: config.max_rows])]
-    targets = _values(value, states)
+    targets, rounding = _values(value, states)
     if ends is not None:
         times = max(1, round(_ENDS * len(states) / len(ends[1])))
         states = np.concatenate([states, *[_states(ends[0], len(reference))] * times])
         targets = np.concatenate([targets, *[ends[1]] * times])
     W, constant = _fit_quadratic(states, reference, targets)
-    if kind == "quadratic" or targets.std() <= _FLAT * np.abs(targets).max():  # a constant has nothing for a network
+    if kind == "quadratic" or targets.std() <= rounding:  # a constant has nothing for a network
         return QuadraticCost(W, x_ref=reference, constant=constant)
 
     e = states - reference
     rest = targets - np.einsum("bi,ij,bj->b", e, W, e) - constant
-    mean, std = states.mean(axis=0), states.std(axis=0)
-    std = np.where(std > _flat(states) * (1.0 + np.abs(mean)), std, 1.0)
-    offset, scale = float(rest.mean()), float(rest.std()) or 1.0
+    mean, std = states.mean(axis=0), spread_of(states, _flat(states))
+    offset, scale = float(rest.mean()), float(rest.std() or targets.std())
     weights, biases = fit_network(
         (states - mean) / std,
         (rest - offset) / scale,
@@ -174,7 +175,7 @@ def terminal_error(cost: TerminalCost, value: StateFunction, observations: Array
         InvalidDataError: If states or their values are not finite.
     """
     states = _states(observations)
-    return _error(cost, states, _values(value, states))
+    return _error(cost, states, _values(value, states)[0])
 
 
 def _error(cost: TerminalCost, states: Array, targets: Array) -> TerminalError:
@@ -206,15 +207,16 @@ def _flat(states: Array) -> float:
     return _FLAT if _narrowed(states).dtype == np.float32 else _FLAT_DOUBLE
 
 
-def _values(value: StateFunction, states: Array) -> Array:
-    """V of states ``(n, nx)`` in float64, ``(n,)``."""
+def _values(value: StateFunction, states: Array) -> tuple[Array, float]:
+    """V of states ``(n, nx)`` in float64, ``(n,)``, and what may be rounding of the largest."""
     with torch.no_grad():
-        values = value(torch.from_numpy(_narrowed(states))).double().numpy()
+        found = value(torch.from_numpy(_narrowed(states)))
+        values = found.double().numpy()
     if values.shape != states.shape[:1] or not np.isfinite(values).all():
         raise InvalidDataError(
             "value", expected=f"{len(states)} finite numbers", actual=f"shape {values.shape}, or NaN or inf in it"
         )
-    return np.asarray(values)
+    return np.asarray(values), _ROUNDINGS * torch.finfo(found.dtype).eps * float(np.abs(values).max())
 
 
 def _fit_quadratic(states: Array, x_ref: Array, targets: Array) -> tuple[Array, float]:

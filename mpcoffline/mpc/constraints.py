@@ -183,6 +183,11 @@ class StateBounds(AnyConstraint):
             )
         return self
 
+    def padded(self, n: int) -> StateBounds:
+        """The bounds with n further coordinates that have none."""
+        free, (low, high) = np.full(n, np.inf), map(np.asarray, (self.low, self.high))
+        return replace(self, low=np.append(low, -free), high=np.append(high, free)) if n else self
+
     def expression(self, x: ca.SX) -> ca.SX:
         """The bounds that exist as a column h <= 0."""
         low, high = np.asarray(self.low), np.asarray(self.high)

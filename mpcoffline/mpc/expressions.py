@@ -16,6 +16,8 @@ from mpcoffline.core import limits
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 
+from .tables import as_arithmetic
+
 _UNARY = (  # noqa: SIM905 -- one per line would fill the page
     "acos acosh asin asinh atan atanh ceil cos cosh erf erfinv exp expm1 fabs floor inv log log1p neg not sign sin sinh"
     " sq sqrt tan tanh twice"
@@ -25,6 +27,7 @@ _BINARY = (  # noqa: SIM905
 ).split()
 _CODES: dict[str, int] = {name: getattr(ca, f"OP_{name.upper()}") for name in (*_UNARY, *_BINARY)}
 _NAMES = {code: name for name, code in _CODES.items()}
+_BINARY_CODES = {_CODES[name] for name in _BINARY}
 
 
 class Instruction(NamedTuple):
@@ -69,11 +72,14 @@ def instructions(function: ca.Function) -> Iterator[Instruction]:
 
 
 def traced(name: str, function: ca.Function) -> ca.Function:
-    """The SX function itself, refused where tracing lost an expression: ``math.sin(x)`` of a symbol is silently NaN.
+    """The SX function, its look-up tables as arithmetic (:mod:`mpcoffline.mpc.tables`).
+
+    It is refused where tracing lost an expression: ``math.sin(x)`` of a symbol is silently NaN.
 
     Raises:
         InvalidArgumentError: If a constant of the function is NaN, or it has more operations than can be solved with.
     """
+    function = without_tables(function)
     check_limit(name, "operations", function.n_instructions(), limits.EXPRESSION_NODES, error=InvalidArgumentError)
     if any(np.isnan(instruction.constant) for instruction in instructions(function)):
         raise InvalidArgumentError(
@@ -100,6 +106,54 @@ def scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.S
     if cost.shape != (1, 1):
         raise InvalidArgumentError(name, expected="a scalar", actual=f"shape {cost.shape}")
     return cost
+
+
+def without_tables(function: ca.Function) -> ca.Function:
+    """An SX function with the tables that it calls as arithmetic; calls of other functions stay."""
+    program = list(instructions(function))
+    called = [k for k, instruction in enumerate(program) if instruction.op == ca.OP_CALL]
+    if not called:
+        return function
+    listing = function.instructions_sx()
+    functions = {k: listing[k].which_function() for k in called}
+    tables = {k: as_arithmetic(of) for k, of in functions.items()}
+    if not any(tables.values()):
+        return function
+    symbols = [ca.SX.sym(function.name_in(i), *function.size_in(i)) for i in range(function.n_in())]
+    work: dict[int, ca.SX] = {}
+    outputs: list[dict[int, ca.SX]] = [{} for _ in range(function.n_out())]
+    for k, (op, sources, targets, constant) in enumerate(program):
+        if op == ca.OP_OUTPUT:
+            outputs[targets[0]][targets[1]] = work[sources[0]]
+        elif op == ca.OP_CONST:
+            work[targets[0]] = ca.SX(constant)
+        elif op == ca.OP_INPUT:
+            work[targets[0]] = symbols[sources[0]].nz[sources[1]]
+        elif op == ca.OP_CALL:
+            found = _called(tables[k] or functions[k], [work[source] for source in sources])
+            work.update({place: result for place, result in zip(targets, found, strict=True) if place >= 0})
+        else:
+            a, *rest = (work[source] for source in sources)
+            work[targets[0]] = ca.SX.binary(op, a, rest[0]) if op in _BINARY_CODES else ca.SX.unary(op, a)
+    results = []
+    for i, elements in enumerate(outputs):
+        result = ca.SX(function.sparsity_out(i))
+        for element, value in elements.items():
+            result.nz[element] = value
+        results.append(result)
+    return ca.Function(function.name(), symbols, results, function.name_in(), function.name_out(), {"cse": True})
+
+
+def _called(function: ca.Function, elements: list[ca.SX]) -> list[ca.SX]:
+    """The elements of a function's outputs, of the elements of its inputs."""
+    arguments, start = [], 0
+    for i in range(function.n_in()):
+        argument = ca.SX(function.sparsity_in(i))
+        for element in range(argument.nnz()):
+            argument.nz[element] = elements[start + element]
+        start += argument.nnz()
+        arguments.append(argument)
+    return [result.nz[k] for result in function.call(arguments) for k in range(result.nnz())]
 
 
 def function_to_json(function: ca.Function) -> dict[str, Any]:

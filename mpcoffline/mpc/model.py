@@ -21,6 +21,7 @@ from .integrators import Scheme, exact_scheme, integrated, is_affine, is_short
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
 from .substeps import Flow, choice_from, choice_on
+from .torch_import import TorchExpression
 
 Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
 
@@ -98,6 +99,58 @@ class Model(Component):
         else:
             asked = None if integrator == "auto" else Scheme.of(integrator)
             self._take(function, integrator, self._first_scheme(function, asked), settled=asked is not None)
+
+    @classmethod
+    def from_torch(
+        cls,
+        module: Any,
+        nx: int,
+        nu: int,
+        dt: float,
+        *,
+        discrete: bool = True,
+        residual: bool = False,
+        learn_weights: bool = False,
+    ) -> Model:
+        """A model from a ``torch.nn.Module`` that was trained elsewhere.
+
+        The module maps rows of ``nx + nu`` numbers, or two arguments ``(x, u)``, to rows of ``nx``. What it is made of
+        becomes CasADi arithmetic: Linear, LayerNorm, BatchNorm1d (as in ``eval()``), Tanh, ReLU, LeakyReLU, ELU, GELU,
+        SiLU, Sigmoid, Softplus, Softsign, Hardtanh, Identity, Dropout (left out), torch's functions of that kind, sums
+        and products with buffers (normalisation), ``torch.cat(..., dim=-1)`` and ``x[..., a:b]``.
+
+        Example:
+            >>> import torch
+            >>> net = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.Tanh(), torch.nn.Linear(64, 2))
+            >>> Model.from_torch(net, nx=2, nu=1, dt=0.05, residual=True).nx
+            2
+
+        Args:
+            module: The network, in any precision; it is copied.
+            nx: Number of states.
+            nu: Number of inputs.
+            dt: Sampling time in s.
+            discrete: Whether it gives the next state; with False it gives dx/dt.
+            residual: Whether it gives the change of the state in a step, ``x+ = x + module(x, u)``.
+            learn_weights: Whether its weights are parameters that learning may change, named as in the module with
+                underscores (``0_weight``); by default they are fixed numbers, with which C computes much faster.
+
+        Raises:
+            InvalidArgumentError: For what cannot be traced, a layer that is not known (it is named), or sizes that do
+                not fit.
+        """
+        network = TorchExpression(module)
+
+        def dynamics(x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+            try:
+                out = network(x, u, p if learn_weights else None)
+            except (RuntimeError, IndexError) as error:
+                raise InvalidArgumentError(
+                    "module", expected=f"one of {nx} + {nu} numbers a row", actual=str(error).splitlines()[-1][:200]
+                ) from error
+            return x + out if residual else out
+
+        return cls(dynamics, nx, nu, dt, network.weights if learn_weights else None, discrete=discrete or residual)
 
     def _take(self, function: ca.Function, integrator: str, scheme: Scheme | None, *, settled: bool = True) -> None:
         """Takes an ODE with its scheme, or without one a map as it is."""

@@ -303,6 +303,23 @@ class ParameterSpace(Sequence[Block]):
             theta[self.slices[name]] = by_name[name].coordinates(value)
         return self.checked(theta)
 
+    def along(self, values: Mapping[str, ArrayLike], n: int) -> Array:
+        """One theta a stage, ``(n + 1, size)``, from values by name; see :meth:`mpcoffline.MPC.theta_along`."""
+        shapes = {block.name: block.shape for block in self}
+        along: dict[str, Array] = {}
+        for name, value in values.items():
+            array, shape = np.asarray(value, dtype=np.float64), shapes.get(name, np.shape(value))
+            if array.shape == (n, *shape):
+                array = np.concatenate([array, array[-1:]])
+            elif array.shape == shape:
+                array = np.broadcast_to(array, (n + 1, *shape))
+            if array.shape != (n + 1, *shape):
+                raise InvalidArgumentError(
+                    name, expected=f"shape {shape}, {(n, *shape)} or {(n + 1, *shape)}", actual=f"shape {array.shape}"
+                )
+            along[name] = array
+        return np.stack([self.pack({name: array[k] for name, array in along.items()}) for k in range(n + 1)])
+
     def checked(self, theta: ArrayLike) -> Array:
         """Theta as float64 ``(size,)``, refused when of the wrong shape, not finite or out of bounds.
 

@@ -243,23 +243,7 @@ class MPC:
             UnknownIdError: For a name that no parameter has.
             InvalidArgumentError: For a wrong shape, a matrix that is not PSD, or a value out of bounds.
         """
-        n = self.horizon
-        shapes = {block.name: block.shape for block in self.space}
-        along: dict[str, Array] = {}
-        for name, value in values.items():
-            array, shape = np.asarray(value, dtype=np.float64), shapes.get(name, np.shape(value))
-            if array.shape == (n, *shape):
-                array = np.concatenate([array, array[-1:]])
-            elif array.shape == shape:
-                array = np.broadcast_to(array, (n + 1, *shape))
-            if array.shape != (n + 1, *shape):
-                raise InvalidArgumentError(
-                    name, expected=f"shape {shape}, {(n, *shape)} or {(n + 1, *shape)}", actual=f"shape {array.shape}"
-                )
-            along[name] = array
-        return np.stack([self.space.pack({name: array[k] for name, array in along.items()}) for k in range(n + 1)])[
-            None
-        ]
+        return self.space.along(values, self.horizon)[None]
 
     def with_delay(self, delay: int | Sequence[int] | None) -> Self:
         """The same problem with another dead time, see :class:`Model`.
@@ -335,12 +319,7 @@ class MPC:
     @property
     def state_bounds(self) -> list[StateBounds]:
         """The bounds of x_1 ... x_N, on z; past inputs have none."""
-        given, free = [c for c in self._constraints if isinstance(c, StateBounds)], np.full(self.nx - self.ny, np.inf)
-        if not free.size:
-            return given
-        return [
-            replace(c, low=np.append(np.asarray(c.low), -free), high=np.append(np.asarray(c.high), free)) for c in given
-        ]
+        return [c.padded(self.nx - self.ny) for c in self._constraints if isinstance(c, StateBounds)]
 
     @property
     def _constraints(self) -> tuple[Constraint | StateBounds, ...]:

@@ -29,7 +29,8 @@ class Scaling:
     """States and inputs of a log, and how much they and its cost vary.
 
     Attributes:
-        states: Some of the states, ``(n, nx)``.
+        states: Some of the MPC's states, ``(n, nx)``; or of what the plant's map is given (``MPC.plant_function``),
+            for the model alone.
         inputs: The inputs there, ``(n, nu)``.
         increments: Spread of the increments s+ - s, ``(nx,)``.
         cost: Spread of the cost.
@@ -76,8 +77,10 @@ class Scaling:
 
     def _natural(self, mpc: MPC, index: Array, theta: Array, *, in_model: bool) -> Array:
         """What changes prediction or cost by a spread, ``(p,)``; the block's size where nothing does."""
-        x, u, p = _symbols(mpc)
-        function, spread = (mpc.dynamics_function, self.increments) if in_model else (mpc.stage_function, self.cost)
+        of_plant = (self.states.shape[1], self.inputs.shape[1]) != (mpc.nx, mpc.nu)  # without what it remembers
+        x, u, p = _symbols(mpc, self.states.shape[1], self.inputs.shape[1])
+        model = mpc.plant_function if of_plant else mpc.dynamics_function
+        function, spread = (model, self.increments) if in_model else (mpc.stage_function, self.cost)
         slopes = ca.jacobian(function(x, u, p) / spread, p)[:, index.tolist()]
         squares = self._mean_squares(slopes, (x, u, p), mpc.theta).reshape(-1, len(index), order="F")
         sensitivity = np.sqrt(squares.sum(axis=0))
@@ -88,7 +91,7 @@ class Scaling:
         """The unit of each entry of a factor C, whose square is what acts."""
         n = round((np.sqrt(8 * len(theta) + 1) - 1) / 2)
         rows, columns = np.tril_indices(n)
-        x, u, p = _symbols(mpc)
+        x, u, p = _symbols(mpc, mpc.nx, mpc.nu)
         cost = mpc.stage_function(x, u, p)
         diagonal = [p[int(k)] for k in index[rows == columns]]
         curvatures = ca.vertcat(*(ca.jacobian(ca.jacobian(cost, c), c) for c in diagonal)) / (2.0 * self.cost)
@@ -111,8 +114,19 @@ class Scaling:
         return np.asarray(np.square(values[:, good]).mean(axis=1)) if good.any() else np.zeros(len(values))
 
 
-def _symbols(mpc: MPC) -> tuple[ca.SX, ca.SX, ca.SX]:
-    return ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
+def _symbols(mpc: MPC, nx: int, nu: int) -> tuple[ca.SX, ca.SX, ca.SX]:
+    return ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("theta", mpc.space.size)
+
+
+def spread_of(values: NDArray[np.floating[Any]], rounding: float = 0.0) -> Array:
+    """The standard deviation of each column ``(d,)``; its size where it does not vary, and 1 where that is zero.
+
+    Args:
+        values: ``(n, d)``.
+        rounding: Share of its size below which a deviation is none.
+    """
+    spread, size = (np.asarray(v, dtype=np.float64) for v in (values.std(axis=0), np.abs(values).max(axis=0)))
+    return np.where(spread > rounding * size, spread, np.where(size > 0.0, size, 1.0))
 
 
 def cost_spread(costs: NDArray[np.floating[Any]]) -> float:

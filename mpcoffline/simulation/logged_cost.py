@@ -53,9 +53,9 @@ class LoggedCost:
         rng = np.random.default_rng(seed)
         self._seen = table.ny if seen is None else seen
         table = table if self._seen == table.ny else gathered(table, range(self._seen))
-        self._level = float(table.centring.centre[table.ny + table.nu])  # a large constant, which ridges would shrink
         train, test = table.split(1.0 - _HELD_OUT, seed) if table.n_episodes > 4 else _rows_split(table, rng)
         (x, cost), (x_test, cost_test) = (_sample(part, rng) for part in (train, test))
+        self._level = float(cost.mean())  # a large constant, which ridges would shrink
         self._features = RandomFeatures(x, 0, rng)
         self._fit(x, cost)
         self.exact = self._known is not None or self._r2(x_test, cost_test) > _EXACT

@@ -25,6 +25,17 @@ STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
 def mpc_of(case: str) -> MPC:
+    if case == "late inputs":
+        cost = QuadraticCost(np.diag([1.0, 0.1]), 0.1 * np.eye(2), u_ref=[0.1, 0.0], D=0.2 * np.eye(2))
+        model = Model(
+            lambda x, u, p: ca.vertcat(x[0] + 0.1 * x[1], 0.9 * x[1] + u[0] - 0.3 * ca.sin(u[1])),
+            2,
+            2,
+            0.1,
+            discrete=True,
+            delay=[2, 0],
+        )
+        return MPC(model, cost, QuadraticCost(np.eye(2)), 12, 0.95, [-1.0, -1.0], [1.0, 1.0])
     if case == "three inputs":
         return random_linear(0, nu=3)
     if case == "network":
@@ -42,7 +53,7 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
     return folder / "program"
 
 
-@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "three inputs", "network"])
+@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "three inputs", "network", "late inputs"])
 def test_the_c_code_replays_its_vectors(case: str, tmp_path: Path) -> None:
     files = export_c(MPCPolicy(mpc_of(case)), tmp_path)
     assert {file.name for file in files} >= {"mpc_controller.c", "mpc_controller.h", "CMakeLists.txt"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,7 +99,9 @@ class PredictionError:
         with torch.no_grad():
             missed = reached - problem.predicted(sample, theta)[:, : problem.n_states]
         rows, self._angles = without_jumps(Rows(s.numpy(), a.numpy(), reached.numpy()), -missed.numpy())
-        self._scale = torch.from_numpy(increments_scale(rows.x, rows.reached, centre))
+        self._scale = torch.from_numpy(
+            increments_scale(rows.x, rows.reached, np.atleast_1d(centre)[: problem.n_states])
+        )
 
     def __call__(self, batch: Columns, theta: Tensor) -> Tensor:
         """The mean error over a minibatch, a scalar."""

@@ -8,11 +8,19 @@ from functools import partial
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.learning.known_cost import CostConfig, with_known_cost
 from mpcoffline.learning.method import METHODS, Method
-from mpcoffline.learning.stages import Change, Stage
+from mpcoffline.learning.stages import Change, Known, Stage
 from mpcoffline.learning.value.config import ValueConfig
 
 from .regression import ParameterConfig
-from .stages import LearnParameters, LearnValue, StartConfig, TerminalConfig, identified, with_terminal_cost
+from .stages import (
+    LearnParameters,
+    LearnValue,
+    StartConfig,
+    TerminalConfig,
+    identified,
+    with_dead_time,
+    with_terminal_cost,
+)
 
 
 @METHODS.register("bellman")
@@ -20,9 +28,9 @@ from .stages import LearnParameters, LearnValue, StartConfig, TerminalConfig, id
 class Bellman(Method):
     """The regressions of arXiv:2301.01667 one after the other; no MPC is solved.
 
-    In this order: whether the stage cost is known, identification of the model and removal of measurement noise
-    (``init="identified"``), V_phi by (VALUE), theta by (FIT), the terminal cost from V. By default all are as in
-    :class:`~mpcoffline.learning.Paper`.
+    In this order: whether the stage cost is known, dead time of the inputs, identification of the model and removal of
+    measurement noise (the last three with ``init="identified"``), V_phi by (VALUE), theta by (FIT), the terminal cost
+    from V. By default all are as in :class:`~mpcoffline.learning.Paper`.
 
     Attributes:
         cost: Whether the stage cost is learned.
@@ -47,6 +55,10 @@ class Bellman(Method):
                 actual=f"terminal={self.terminal.method!r}",
                 hint="Set terminal='network' or 'quadratic'.",
             )
+
+    def prepared(self, known: Known) -> Known:
+        """The dead time of the inputs, found in the data or checked (``init="identified"``)."""
+        return with_dead_time(known, self.identify)
 
     def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""

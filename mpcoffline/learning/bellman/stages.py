@@ -13,6 +13,7 @@ from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import identify
+from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.ends import ends_matter, priced_ends
 from mpcoffline.learning.linear_quadratic import riccati_cost
@@ -44,14 +45,32 @@ class StartConfig:
         adapt_above: With ``init="identified"``, steps on cost and model together (``fit_n_steps``) are made only where
             the identified model misses more than this share of an increment (root mean square of the one-step
             errors): where its structure is not the plant's. Else the model stays and the cost alone is fitted.
+        delays: With ``init="identified"``, whether dead time is looked for in the data before all else, where the model
+            says nothing of it (``delay=None``), and checked where it does.
     """
 
     init: Init = "nominal"
     adapt_above: float = 0.0
+    delays: bool = True
 
     def __post_init__(self) -> None:
         check_known("init", self.init, get_args(Init))
         check_number("adapt_above", self.adapt_above, 0.0, open_low=False)
+
+
+def with_dead_time(known: Known, config: StartConfig) -> Known:
+    """The MPC with the dead time that the log shows, where its model says none; where it does, a check of that."""
+    if config.init == "nominal" or not config.delays or known.value_function is not None:
+        return known
+    model, search = known.mpc.model, find_delays(known.mpc, known.table, seed=known.seed)
+    if not search.found:
+        _log.info("Inputs: %s", search)
+    elif model.delay is None:
+        _log.warning("Inputs act late: found a %s. The learned MPC carries the past inputs.", search)
+        return replace(known, mpc=known.mpc.with_delay(search.delay))
+    else:
+        _log.warning("The model's delay is %s, the log says otherwise: a %s.", list(model.delay), search)
+    return known
 
 
 def identified(known: Known, config: StartConfig) -> Known:

@@ -71,7 +71,16 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     return best_status;
 }
 
-void mpc_reset(mpc_state *state) { state->has_plan = 0; }
+void mpc_reset(mpc_state *state) {
+    state->has_plan = 0;
+    for (int i = 0; i < MPC_NX - MPC_NY; ++i) state->past[i] = usual[i];
+}
+
+/* The past inputs of the next step: each entry takes over an earlier one, or the input that is applied now. */
+static void remember(mpc_state *state, const double *u) {
+    for (int i = MPC_NX - MPC_NY - 1; i >= 0; --i)
+        state->past[i] = sources[i] < MPC_NX - MPC_NY ? state->past[sources[i]] : u[sources[i] - (MPC_NX - MPC_NY)];
+}
 
 /* From the plan of the step before; where that is not solved, from all starts. The plan of the state becomes the solution,
  * else the better of the two plans found, else it stays the one before. Returns what mpc_step does. */
@@ -94,7 +103,7 @@ static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
     return found ? 1 : 2;
 }
 
-int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NX], double u[MPC_NU]) {
+int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NY], double u[MPC_NU]) {
     const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, MPC_MAX_ITERATIONS, TOLERANCE};
     const double *theta = (const double *)parameters;
     lanes w;
@@ -103,7 +112,7 @@ int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[
     w.k = state->work_k, w.K = state->work_K;
     for (int i = 0; i < NP; ++i) w.p[i] = theta[i];
     gen_prepare(w.p, w.p + NP);
-    for (int i = 0; i < NX; ++i) w.s[i] = y[i];
+    for (int i = 0; i < NX; ++i) w.s[i] = i < MPC_NY ? y[i] : state->past[i - MPC_NY];
     for (int a = 0; a < NU; ++a) w.low0[a] = low[a], w.high0[a] = high[a];
     if (state->has_plan) {
         answer = improve(&problem, state, &w);
@@ -114,6 +123,7 @@ int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[
         for (int a = 0; a < NU && answer == 3; ++a) state->u[a] = 0.0;
     }
     for (int a = 0; a < NU; ++a) u[a] = clip(state->u[a], low[a], high[a]);
+    remember(state, u);
     /* The plan of the next step, its last input held. */
     for (int i = 0; i < (MPC_HORIZON - 1) * NU; ++i) state->u[i] = state->u[i + NU];
     for (int i = 0; i < MPC_HORIZON * NX; ++i) state->x[i] = state->x[i + NX];

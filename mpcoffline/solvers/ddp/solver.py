@@ -23,6 +23,7 @@ from mpcoffline.solvers.status import Stats, Status
 
 from .build import compiled
 from .codegen import source
+from .rounding import Rounding
 
 _STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE)  # by the kernel's codes
 _LANES = 8
@@ -80,8 +81,12 @@ class DDPSolver(Solver):
     plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
     Otherwise it is the best plan found, and ``status`` says why it was not accepted: ``"iteration limit"``,
-    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one; most often a kink: ``fmax``,
-    ``fabs``, ``if_else``), or ``"not finite"``.
+    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), or ``"not finite"``.
+
+    Slopes that jump or are infinite (``fmax``, ``fabs``, ``if_else``, saturations, dead zones, ``sqrt`` or ``v**0.8``
+    at 0) stop a method that follows them. What is not solved because of them is solved with the corners rounded over
+    1 % of each quantity's range, and again exactly from there; the better plan of the exact model is returned, and it
+    counts as solved if the rounded problem was. The first time, the log says which corners there are.
 
     References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 
@@ -142,6 +147,7 @@ class DDPSolver(Solver):
         self._starts = _address(self._candidates), len(self._candidates), n_starts
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
+        self._rounding: Rounding | None = None
 
     @classmethod
     def refuses(cls, mpc: MPC) -> str:
@@ -150,7 +156,9 @@ class DDPSolver(Solver):
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
-        result = self._run(x, theta, u0, None) if warm_start is None else self._run_warm(x, theta, u0, warm_start)
+        result = self.run(x, theta, u0, warm_start)
+        if np.count_nonzero(result["status"]):
+            self._rounded().improve(self, x, theta, u0, result)
         status = result["status"]
         stats: Stats = {
             "iterations": result["iterations"],
@@ -165,6 +173,26 @@ class DDPSolver(Solver):
         elif self._own_constant:
             value = value + self._own_constant
         return Solution(result["u"][:, 0].copy(), result["x"], result["u"], value, status == 0, ended, stats)
+
+    def _rounded(self) -> Rounding:
+        """What solves the problem where its corners stand in the way; made when it is first needed."""
+        if self._rounding is None:
+
+            def make(mpc: MPC) -> DDPSolver:
+                return DDPSolver(
+                    mpc,
+                    max_iterations=self.max_iterations,
+                    tolerance=self.tolerance,
+                    n_starts=self.n_starts,
+                    n_threads=self._n_threads,
+                )
+
+            self._rounding = Rounding(self.mpc, make)
+        return self._rounding
+
+    def run(self, x: Array, theta: Array, u0: Array | None, plan: Plan | None) -> dict[str, NDArray[Any]]:
+        """Solves problems as they are: warm from a plan, cold without; see :class:`Rounding` for what it returns."""
+        return self._run(x, theta, u0, None) if plan is None else self._run_warm(x, theta, u0, plan)
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         """Problems that have a plan are warm; those that have none, or that it leads nowhere, are cold."""

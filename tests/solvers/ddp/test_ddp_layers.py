@@ -90,6 +90,7 @@ def test_values_and_jacobians_are_casadis(name: str) -> None:
             np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_plans_are_ipopts() -> None:
     mpc = problem(CASES["hybrid"])
     states = np.random.default_rng(5).normal(size=(1, 4))
