@@ -17,7 +17,7 @@ from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.closed_loop import Simulation, initial_states, simulate
+from mpcoffline.simulation.closed_loop import Simulation, initial_rows, signals_along, simulate
 from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
 
@@ -97,12 +97,13 @@ def diagnose(
     seen = None if learned.layout.has_previous else learned.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
-    starts = initial_states(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
-    first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps) for policy in policies)
+    rows = initial_rows(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
+    starts, signals = clean.take(rows).values().observations, signals_along(clean, rows, n_steps, learned.layout)
+    first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps, signals) for policy in policies)
     comparison = Comparison.of(first, second, cost.r2)
     lag = lag_check(identified, clean)
     verdict, reasons = decide(comparison, lag, found.noise, len(table))
-    reference = learned.reference
+    reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
     report = Report(
         verdict=verdict,
         reasons=reasons,
@@ -122,8 +123,8 @@ def diagnose(
         n_rows=len(table),
         n_episodes=table.n_episodes,
         traces=Traces(
-            first.states[..., : learned.ny],
-            second.states[..., : learned.ny],
+            first.states[..., : learned.layout.n_states],
+            second.states[..., : learned.layout.n_states],
             np.stack(returns_of(learner.value_function, clean, learned.discount)),
             reference,
         ),

@@ -220,7 +220,7 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
     scale, plant = increments_scale(x, reached[:, :n], table.centring.centre[:n]), identified.plant_function
     predicted, without = (
         np.asarray(plant(x.T, v.T, identified.theta).full().T)
-        for v in (acting, np.broadcast_to(acting.mean(axis=0), acting.shape))
+        for v in (acting, np.hstack([np.broadcast_to(u.mean(axis=0), u.shape), acting[:, u.shape[1] :]]))
     )
     effect, errors = (predicted - without) / scale, (reached[:, :n] - predicted) / scale
     good = np.isfinite(errors).all(axis=1) & np.isfinite(effect).all(axis=1)

@@ -121,7 +121,7 @@ class _Scan:
     def __init__(self, mpc: MPC, table: TransitionTable, seed: int) -> None:
         columns, n = table.values(), mpc.layout.n_states
         self._x, self._reached = columns.observations[:, :n], columns.next_observations[:, :n]
-        self._u = columns.actions
+        self._u, self._signals = columns.actions, columns.observations[:, mpc.layout.present]
         self._before = rows_before(table)
         starts = self._before % _PIECE == 0
         piece = np.cumsum(starts) - 1
@@ -222,9 +222,10 @@ class _Scan:
         return min((some.descend(z, _PRIOR, iterations) for z in starts), key=attrgetter("cost")).z
 
     def _acting(self, delay: tuple[int, ...]) -> Array:
-        """The inputs that act in each row, ``(n, nu)``; anything where they are not known."""
+        """The inputs that act in each row, and its signals, ``(n, nu + n_signals)``; anything where not known."""
         rows = np.arange(len(self._u))
-        return np.stack([self._u[np.maximum(rows - d, 0), i] for i, d in enumerate(delay)], axis=1)
+        inputs = np.stack([self._u[np.maximum(rows - d, 0), i] for i, d in enumerate(delay)], axis=1)
+        return np.hstack([inputs, self._signals])
 
     def _ahead(self, delay: tuple[int, ...], other: tuple[int, ...]) -> float:
         """Mean square error over 15 steps without correction, in spreads of the states, from where both know enough."""

@@ -36,6 +36,8 @@ def plant_rows(mpc: MPC, table: TransitionTable) -> TransitionTable:
 def settled(mpc: MPC, table: TransitionTable) -> Array:
     """Where the MPC's state is at rest at its reference, ``(nx,)``; the reference (zero without one) for a plain state.
 
+    Signals are at their mean, and what tracks one is there.
+
     For past inputs that is what holds the model at the reference, as well as the bounds allow::
 
         argmin_u |(f(x_ref, u) - x_ref) / scale|^2          scale: spread of the logged increments
@@ -44,10 +46,18 @@ def settled(mpc: MPC, table: TransitionTable) -> Array:
         mpc: The MPC.
         table: Transitions of its states, for scales and the input to begin with.
     """
-    reference = np.zeros(mpc.ny) if mpc.reference is None else mpc.reference
-    if not mpc.layout.n_memory:
+    reference, n = np.zeros(mpc.layout.n_states) if mpc.reference is None else mpc.reference, mpc.layout.n_states
+    if mpc.layout.is_plain:
         return reference
-    rows, low, high, n = table.sample(_ROWS, 0).values(), *_bounds(mpc), mpc.layout.n_states
+    rows, low, high = table.sample(_ROWS, 0).values(), *_bounds(mpc)
+    if mpc.layout.signals:
+        signals = rows.observations[:, n : mpc.ny].mean(axis=0)
+        means = {s.name: signals[i - n] for s, i in zip(mpc.layout.signals, mpc.layout.present, strict=True)}
+        tracks = getattr(mpc.stage_cost, "tracks", {})
+        followed = [means[tracks[i]] if i in tracks else 0.0 for i in range(n)]
+        reference = np.concatenate([reference + followed, signals])
+        if not mpc.layout.n_memory:
+            return reference
     spread = (rows.next_observations - rows.observations)[:, :n].std(axis=0)
     scale, size = (np.where(v > 0.0, v, 1.0) for v in (spread, rows.actions.std(axis=0)))
 

@@ -110,7 +110,8 @@ class Run:
         """What the stages begin with: past inputs beside the observations where the MPC holds some, then trimmed."""
         known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
         table = with_memory(known.table, known.mpc.layout)
-        return replace(known, table=innermost(table, self.method.trim, self._mpc.discount, known.mpc.ny))
+        n = known.mpc.layout.n_states
+        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n))
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

@@ -59,7 +59,7 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     """What is known of the stage cost, from the rows as they were logged: smoothed ones would blur it."""
     if config.stage_cost == "fitted":
         return known
-    rows = _excerpt(known.table, known.seed)
+    rows = excerpt(known.table, known.seed)
     found = known_cost(known.mpc, rows)
     if found is None and config.stage_cost == "auto":
         other = _with_fitted_weights(known.mpc, rows)
@@ -78,11 +78,13 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
             100.0 * found.agreeing,
         )
     if found.constant:
-        says = "all costs are %g, so they do not tell what is good"
-        if np.asarray(known.table.terminations).any():
-            says = "the costs are %g until an episode ends: they say when that is, but not what is better before"
-        kept = "; stage and terminal cost stay the given ones, and the model is learned"
-        _log.warning("%s: " + says + kept, known.table.name, found.offset)
+        _log.warning(
+            "%s: all costs are %g, so they do not tell what is good%s; stage and terminal cost stay the given ones, "
+            "and the model is learned",
+            known.table.name,
+            found.offset,
+            ", but that episodes should not end, or should" if np.any(known.table.terminations) else "",
+        )
     return replace(known, cost=found)
 
 
@@ -232,7 +234,7 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     return mpc.with_theta(with_level(mpc, fitted, float(missed(fitted).mean())))
 
 
-def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
+def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
     """The table, or of a large one some stretches of consecutive rows."""
     n_blocks, wanted = -(-len(table) // _BLOCK), _ROWS // _BLOCK
     if n_blocks <= wanted:

@@ -160,7 +160,9 @@ class Method(ABC):
         if self.cross_term and type(cost) is QuadraticCost and cost.nu and "H" not in cost.values:
             values, cross = cost.values, np.zeros((cost.nx, cost.nu))
             constant = float(values["constant"])
-            crossed = QuadraticCost(cost.W, cost.R, cross, values["x_ref"], values["u_ref"], constant, values.get("D"))
+            references = values["x_ref"], values["u_ref"]
+            D = values.get("D")
+            crossed = QuadraticCost(cost.W, cost.R, cross, *references, constant, D=D, tracks=cost.tracks)
             return mpc.replace(stage_cost=crossed)
         if self.cross_term:
             _log.warning("cross_term has no effect on a stage cost that is not quadratic or has one already")

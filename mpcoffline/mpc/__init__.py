@@ -6,11 +6,13 @@ from .component import COSTS, StageCost, TerminalCost
 from .constraints import CONSTRAINTS, AnyConstraint, Constraint, Penalty, StateBounds
 from .cost import NormCost, QuadraticCost
 from .expression_cost import ExpressionCost
+from .integration_check import IntegrationCheck
 from .lifted import LiftedCost, polynomial_features
 from .model import Model
 from .networks import ConvexNetworkCost, NetworkCost
 from .parameters import Block, Parameter, ParameterSpace
 from .problem import MPC
+from .signals import Signal
 
 __all__ = [
     "CONSTRAINTS",
@@ -21,6 +23,7 @@ __all__ = [
     "Constraint",
     "ConvexNetworkCost",
     "ExpressionCost",
+    "IntegrationCheck",
     "LiftedCost",
     "Model",
     "NetworkCost",
@@ -29,6 +32,7 @@ __all__ = [
     "ParameterSpace",
     "Penalty",
     "QuadraticCost",
+    "Signal",
     "StageCost",
     "StateBounds",
     "TerminalCost",

@@ -69,7 +69,11 @@ class StageCost(Protocol):
     A class that says ``uses_previous = True`` has a price on changes of inputs: its expression is called with the
     inputs of the step before ``(nu, 1)`` as fourth argument, which the MPC's model then carries along.
 
-    The state x is the observation ``(ny, 1)``; where the cost has an attribute ``nx`` that is the size of the whole
+    A class that says ``uses_signals = True`` is given the present signals by name as keyword argument ``d``
+    (``d.price``), ``terminal_expression`` too.
+
+    The state x is the observation ``(ny, 1)``; where the cost has an attribute ``nx`` that is the number of the plant's
+    states, it is these, and where the cost has an attribute ``nx`` that is the size of the whole
     state of the MPC, past inputs included, it is that.
     """
 

@@ -15,6 +15,7 @@ from mpcoffline.core.types import Array
 
 from .component import COSTS, Component, blocks_from_json, difference, numbers, vector
 from .parameters import Block, ParameterSpace
+from .signals import Named
 
 
 @COSTS.register("QuadraticCost")
@@ -42,9 +43,11 @@ class QuadraticCost(Component):
         u_ref: Input reference, ``(nu,)``; zero by default.
         constant: The offset theta_3 of (COST).
         D: Weight of changes of the inputs, ``(nu, nu)``; needs ``R``.
+        tracks: Which states follow which signals, ``{1: "set_point"}``: e_1 = x_1 - d.set_point - x_ref_1.
 
     Raises:
-        InvalidArgumentError: If shapes do not fit, or the weights are not symmetric positive semidefinite.
+        InvalidArgumentError: If shapes do not fit, what tracks a signal is no state, or the weights are not symmetric
+            positive semidefinite.
     """
 
     convex: ClassVar[bool] = True
@@ -58,6 +61,7 @@ class QuadraticCost(Component):
         u_ref: ArrayLike | None = None,
         constant: float = 0.0,
         D: ArrayLike | None = None,
+        tracks: Mapping[int, str] | None = None,
     ) -> None:
         weight = np.atleast_2d(numbers("W", W))
         nx = weight.shape[0]
@@ -82,8 +86,13 @@ class QuadraticCost(Component):
         if offset.ndim > 0:
             raise InvalidArgumentError("constant", expected="one number", actual=f"shape {offset.shape}")
         blocks.append(Block.free("constant", offset, "cost"))
-        self.nx, self.nu = nx, nu
+        self.nx, self.nu, self.tracks = nx, nu, _checked_tracks(tracks or {}, nx)
         self.space = ParameterSpace(blocks)
+
+    @property
+    def uses_signals(self) -> bool:
+        """Whether a state follows a signal."""
+        return bool(self.tracks)
 
     @property
     def W(self) -> Array:
@@ -114,7 +123,9 @@ class QuadraticCost(Component):
             return values["H"]
         return scipy.linalg.block_diag(values["W"], values["R"]) if "R" in values else values["W"]
 
-    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX], previous: ca.SX | None = None) -> ca.SX:
+    def expression(
+        self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX], previous: ca.SX | None = None, d: Named | None = None
+    ) -> ca.SX:
         """(COST) as a CasADi scalar; ``p["W"]`` is the factor C of W = C C', so that ``e'We = |C'e|^2``.
 
         Args:
@@ -122,8 +133,9 @@ class QuadraticCost(Component):
             u: Inputs, ``(nu, 1)``.
             p: The parameters.
             previous: The inputs of the step before, ``(nu, 1)``; where there is no ``D``, they are not asked for.
+            d: The present signals; where nothing tracks one, they are not asked for.
         """
-        cost = self._stationary(x, u, p)
+        cost = self._stationary(self._away(x, d), u, p)
         if previous is not None and "D" in p:
             cost = cost + ca.sumsqr(p["D"].T @ difference("u", u, previous))
         return cost
@@ -138,15 +150,25 @@ class QuadraticCost(Component):
             cost += ca.sumsqr(p["R"].T @ difference("u", u, p["u_ref"]))
         return cost
 
-    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX], d: Named | None = None) -> ca.SX:
         """The terminal cost e'We + constant as a CasADi scalar."""
-        e = self._error(x, p)
+        e = self._error(self._away(x, d), p)
         factor = p["W"] if "W" in p else p["H"][: e.numel(), :]
         return ca.sumsqr(factor.T @ e) + p["constant"]
 
     def _error(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """What W weighs: e = x - x_ref."""
         return difference("x", x, p["x_ref"])
+
+    def _away(self, x: ca.SX, d: Named | None) -> ca.SX:
+        """The state, those that track a signal as their distance from it."""
+        if d is None or not self.tracks:
+            return x
+        return x - ca.vertcat(*(d[self.tracks[i]] if i in self.tracks else 0.0 for i in range(x.numel())))
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description."""
+        return super().to_json() | {"tracks": [[i, name] for i, name in self.tracks.items()]}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
@@ -156,6 +178,7 @@ class QuadraticCost(Component):
         values = cost.values
         cost.nx = len(values["x_ref"])
         cost.nu = len(values["u_ref"]) if "u_ref" in values else 0
+        cost.tracks = _checked_tracks(dict(data["tracks"]), cost.nx)
         return cost
 
 
@@ -201,6 +224,13 @@ class NormCost(Component):
         cost.space = blocks_from_json(data)
         cost.nx = len(cost.values["x_ref"])
         return cost
+
+
+def _checked_tracks(tracks: Mapping[int, str], nx: int) -> dict[int, str]:
+    for i, name in tracks.items():
+        if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < nx or not isinstance(name, str):
+            raise InvalidArgumentError("tracks", expected=f"names of signals by state, 0 to {nx - 1}", actual=f"{i!r}")
+    return dict(tracks)
 
 
 def _weight_blocks(W: Array, R: Array, S: ArrayLike | None) -> list[Block]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -14,7 +14,9 @@ from mpcoffline.core.limits import check_limit
 
 from .component import COSTS, Component, StageCost, TerminalCost, blocks_from_json
 from .expressions import function_from_json, function_to_json, traced
+from .layout import Layout
 from .parameters import ParameterSpace
+from .seen import stage_expression, terminal_expression
 
 
 @COSTS.register("ExpressionCost")
@@ -72,20 +74,14 @@ class ExpressionCost(Component):
 
 
 def cost_to_json(
-    cost: StageCost | TerminalCost,
-    expression: Callable[..., ca.SX],
-    nx: int,
-    nu: int | None = None,
-    *,
-    portable: bool = False,
+    cost: StageCost | TerminalCost, layout: Layout, *, stage: bool, portable: bool = False
 ) -> dict[str, Any]:
     """A cost as its class writes it, or, where no file can name that class, by its expression.
 
     Args:
         cost: The cost.
-        expression: Its value ``(x, u, p) -> L``, or ``(x, p) -> T``, in the state of the problem.
-        nx: Number of states of the problem.
-        nu: Number of inputs; None for a terminal cost.
+        layout: What the state of its problem is made of.
+        stage: Whether it is a stage cost.
         portable: Whether classes from outside this package are written by their expression, too.
 
     Raises:
@@ -94,10 +90,10 @@ def cost_to_json(
     own: Any = cost
     if name := COSTS.name_of(type(cost), shared=portable):
         return dict(own.to_json()) | {"kind": name}
-    theta = ca.SX.sym("theta", cost.space.size)
-    variables = [ca.SX.sym("x", nx), *([] if nu is None else [ca.SX.sym("u", nu)])]
-    value = ca.densify(ca.SX(expression(*variables, cost.space.symbols(theta))))
-    function = ca.Function("cost", [*variables, theta], [value])
+    z, u, theta = ca.SX.sym("x", layout.nx), ca.SX.sym("u", layout.nu), ca.SX.sym("theta", cost.space.size)
+    p = cost.space.symbols(theta)
+    value = stage_expression(layout, own, z, u, p) if stage else terminal_expression(layout, own, z, p)
+    function = ca.Function("cost", [z, u, theta] if stage else [z, theta], [ca.densify(value)])
     return ExpressionCost(function, cost.space, convex=bool(getattr(cost, "convex", False))).to_json()
 
 

@@ -1,8 +1,9 @@
-"""What the state of an MPC is made of: the plant's states, and the inputs of past steps.
+"""What the state of an MPC is made of: the plant's states, signals from outside, and the inputs of past steps.
 
-An observation y is what a plant's log holds. The MPC's own state is z = [y, memory], where the memory holds as many
-past values of each input as it needs: those that have not acted yet, where an input acts with dead time, and the one
-before, where its changes have a price. Solvers, V and regressions see a model z+ = f(z, u) like any other.
+An observation y is what a plant's log holds: its states, then its signals. The MPC's own state is z = [y, memory],
+where the memory holds as many past values of each input as it needs: those that have not acted yet, where an input acts
+with dead time, and the one before, where its changes have a price. Solvers, V and regressions see a model z+ = f(z, u)
+like any other.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.types import Array
 
+from .signals import Named, Signal
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -29,22 +32,27 @@ class Layout:
 
     ::
 
-        z = [x, u_0[k-1], u_0[k-2], ..., u_1[k-1], ...]          as many of each input as ``carried`` says
+        z = [x, signals, u_0[k-1], u_0[k-2], ..., u_1[k-1], ...]     as many of each input as ``carried`` says
+
+    Signals move along a horizon as they were previewed, and stay at the last value that is known.
 
     Attributes:
         n_states: Number of the plant's states.
         nu: Number of inputs.
         delay: Dead time of each input in sampling steps, ``(nu,)``: the input of step k acts from step k + delay on.
         carried: Past values of each input in the memory, ``(nu,)``, at least ``delay``.
+        signals: What comes from outside.
 
     Raises:
-        InvalidArgumentError: For a delay of another length or a negative one, or more states than can be solved with.
+        InvalidArgumentError: For two signals of one name, a delay of another length or a negative one, or more states
+            than can be solved with.
     """
 
     n_states: int
     nu: int
     delay: tuple[int, ...]
     carried: tuple[int, ...]
+    signals: tuple[Signal, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.delay) != self.nu or len(self.carried) != self.nu:
@@ -53,11 +61,16 @@ class Layout:
             )
         if any(m < d for m, d in zip(self.carried, self.delay, strict=True)):
             raise InvalidArgumentError("carried", expected=f"at least {self.delay}", actual=str(self.carried))
-        what = "of them, with past inputs" if self.n_memory else "of them"
+        names = [signal.name for signal in self.signals]
+        if len(set(names)) < len(names):
+            raise InvalidArgumentError("names of signals", expected="unique names", actual=str(names))
+        what = "of them, with signals and past inputs" if self.nx > self.n_states else "of them"
         check_limit("nx", what, self.nx, limits.STATES, error=InvalidArgumentError)
 
     @classmethod
-    def of(cls, n_states: int, nu: int, delay: int | Sequence[int] | None = None) -> Layout:
+    def of(
+        cls, n_states: int, nu: int, delay: int | Sequence[int] | None = None, signals: Sequence[Signal] = ()
+    ) -> Layout:
         """The layout of a plant; a delay of one number is that of all inputs, None is none.
 
         Raises:
@@ -69,11 +82,14 @@ class Layout:
         given = (known,) * int(nu) if np.ndim(known) == 0 else tuple(known)
         check_integers(0, **{f"delay[{i}]": d for i, d in enumerate(given)})
         delays = tuple(int(d) for d in given)
-        return cls(int(n_states), int(nu), delays, delays)
+        for signal in signals:
+            if not isinstance(signal, Signal):
+                raise InvalidArgumentError("signals", expected="a list of Signal", actual=repr(signal)[:200])
+        return cls(int(n_states), int(nu), delays, delays, tuple(signals))
 
     def with_delay(self, delay: int | Sequence[int] | None) -> Layout:
         """The same with another dead time, and no more memory than that and prices on changes need."""
-        other = Layout.of(self.n_states, self.nu, delay)
+        other = Layout.of(self.n_states, self.nu, delay, self.signals)
         return other.with_previous() if self.has_previous else other
 
     def with_previous(self) -> Layout:
@@ -83,7 +99,22 @@ class Layout:
     @property
     def ny(self) -> int:
         """Size of an observation."""
-        return self.n_states
+        return self.n_states + sum(signal.size for signal in self.signals)
+
+    @cached_property
+    def present(self) -> NDArray[np.intp]:
+        """Where in y the present value of each signal stands, ``(n_signals,)``."""
+        sizes = [signal.size for signal in self.signals]
+        return np.array([self.n_states + sum(sizes[:i]) for i in range(len(sizes))], dtype=np.intp)
+
+    def named(self, values: ca.SX) -> Named:
+        """Present values of the signals, a CasADi column, by name."""
+        return Named([signal.name for signal in self.signals], values)
+
+    @property
+    def usual_signals(self) -> Array:
+        """The columns of the signals where none is known, ``(ny - n_states,)``."""
+        return np.concatenate([np.zeros(0), *(np.full(signal.size, signal.usual) for signal in self.signals)])
 
     @property
     def n_memory(self) -> int:
@@ -123,8 +154,9 @@ class Layout:
 
     @cached_property
     def acting(self) -> NDArray[np.intp]:
-        """Where in [z, u] the values stand that the plant's map is given as inputs, ``(nu,)``."""
-        return np.array([self._place(i, d) for i, d in enumerate(self.delay)], dtype=np.intp)
+        """Where in [z, u] the inputs stand that the plant's map is given: ``(nu,)`` and the present signals."""
+        inputs = [self._place(i, d) for i, d in enumerate(self.delay)]
+        return np.concatenate([np.array(inputs, dtype=np.intp), self.present])
 
     @cached_property
     def previous(self) -> NDArray[np.intp]:
@@ -140,8 +172,10 @@ class Layout:
     @cached_property
     def sources(self) -> NDArray[np.intp]:
         """Where in [z, u] the next value of each entry of z beyond the plant's states stands, ``(nx - n_states,)``."""
-        inputs, ages = self.ages
-        return np.array([self._place(i, age - 1) for i, age in zip(inputs, ages, strict=True)], dtype=np.intp)
+        ends = np.append(self.present, self.ny)[1:]
+        shown = [min(j + 1, end - 1) for start, end in zip(self.present, ends, strict=True) for j in range(start, end)]
+        past = [self._place(i, age - 1) for i, age in zip(*self.ages, strict=True)]
+        return np.array([*shown, *past], dtype=np.intp)
 
     @property
     def names(self) -> tuple[str, ...]:

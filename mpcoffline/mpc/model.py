@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import logging
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.places import warn_once
 from mpcoffline.core.types import Array
 
 from .component import Component, blocks_from_json
-from .expressions import function_from_json, function_to_json, traced
+from .expressions import function_from_json, function_to_json, is_affine, traced
 from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfall
-from .integrators import Scheme, exact_scheme, integrated, is_affine, is_short
+from .integrators import Scheme, exact_scheme, integrated, is_short
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
-from .substeps import Flow, choice_from, choice_on
+from .signals import Signal
+from .substeps import Choice, Flow, choice_from, choice_on
 from .torch_import import TorchExpression
 
-Dynamics = Callable[[ca.SX, ca.SX, dict[str, ca.SX]], ca.SX]
-
-logger = logging.getLogger(__name__)
+Dynamics = Callable[..., ca.SX]  # (x, u, p) or, with signals, (x, u, p, d)
 
 
 class Model(Component):
@@ -54,6 +54,8 @@ class Model(Component):
         discrete: Whether ``dynamics`` is already the discrete-time map.
         integrator: ``"auto"``; ``"exact"``, for an ODE that is affine in (x, u); ``"rk4"``, one Runge-Kutta step a
             sampling time; ``"rk4:N"``, N of them.
+        signals: What comes from outside: :class:`Signal` columns of the observation after the plant's states. Dynamics
+            that take a fourth argument get their present values by name, ``(x, u, p, d)`` with ``d.price``.
         delay: Dead time of the inputs in sampling steps, one number or one an input: the input of step k acts from step
             k + delay on. None, the default, is not known: the learner looks for it in the data. 0 is known to be none.
 
@@ -84,8 +86,9 @@ class Model(Component):
         discrete: bool = False,
         integrator: str = "auto",
         delay: int | Sequence[int] | None = None,
+        signals: Sequence[Signal] = (),
     ) -> None:
-        layout = Layout.of(nx, nu, delay)
+        layout = Layout.of(nx, nu, delay, signals)
         if not (np.isfinite(dt) and dt > 0.0):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
         if discrete and integrator != "auto":
@@ -111,6 +114,8 @@ class Model(Component):
         discrete: bool = True,
         residual: bool = False,
         learn_weights: bool = False,
+        integrator: str = "auto",
+        delay: int | Sequence[int] | None = None,
     ) -> Model:
         """A model from a ``torch.nn.Module`` that was trained elsewhere.
 
@@ -134,6 +139,8 @@ class Model(Component):
             residual: Whether it gives the change of the state in a step, ``x+ = x + module(x, u)``.
             learn_weights: Whether its weights are parameters that learning may change, named as in the module with
                 underscores (``0_weight``); by default they are fixed numbers, with which C computes much faster.
+            integrator: As in the class, for ``discrete=False``.
+            delay: As in the class.
 
         Raises:
             InvalidArgumentError: For what cannot be traced, a layer that is not known (it is named), or sizes that do
@@ -150,7 +157,9 @@ class Model(Component):
                 ) from error
             return x + out if residual else out
 
-        return cls(dynamics, nx, nu, dt, network.weights if learn_weights else None, discrete=discrete or residual)
+        parameters = network.weights if learn_weights else None
+        is_map = discrete or residual
+        return cls(dynamics, nx, nu, dt, parameters, discrete=is_map, integrator=integrator, delay=delay)
 
     def _take(self, function: ca.Function, integrator: str, scheme: Scheme | None, *, settled: bool = True) -> None:
         """Takes an ODE with its scheme, or without one a map as it is."""
@@ -193,6 +202,17 @@ class Model(Component):
         other._lay_out(self.layout.with_previous(), self.plant)
         return other
 
+    def plus(self, addition: ca.Function) -> Self:
+        """The same model with something added to the plant's map, which is a discrete one then.
+
+        Args:
+            addition: A CasADi function ``(x, u) -> (n_states, 1)`` of the plant's states and the inputs that act.
+        """
+        x, u, theta = (ca.SX.sym(name, *self.plant.size_in(i)) for i, name in enumerate("xup"))
+        other = copy.copy(self)
+        other._take(ca.Function("dynamics", [x, u, theta], [self.plant(x, u, theta) + addition(x, u)]), "map", None)
+        return other
+
     def _first_scheme(self, ode: ca.Function, asked: Scheme | None) -> Scheme:
         """The scheme asked for, else the exponential of an affine ODE, else one RK4 step until more is known."""
         if asked is not None and asked.kind == "rk4":
@@ -207,11 +227,12 @@ class Model(Component):
         return Scheme("rk4")
 
     def _traced(self, dynamics: Dynamics) -> ca.Function:
-        """What the user wrote as SX function (x, u, p), p being this model's flat parameter vector."""
-        x, u = ca.SX.sym("x", self.layout.n_states), ca.SX.sym("u", self.nu)
+        """What the user wrote as SX function (x, [u, d], p), p being this model's flat parameter vector."""
+        x, u = ca.SX.sym("x", self.layout.n_states), ca.SX.sym("u", len(self.layout.acting))
         theta = ca.SX.sym("p", self.space.size)
+        outside = [self.layout.named(u[self.nu :])] if _takes_signals(dynamics) else []
         try:
-            value = ca.densify(ca.SX(dynamics(x, u, self.space.symbols(theta))))
+            value = ca.densify(ca.SX(dynamics(x, u[: self.nu], self.space.symbols(theta), *outside)))
             if value.shape != (self.layout.n_states, 1):
                 raise InvalidArgumentError(
                     "dynamics",
@@ -261,19 +282,15 @@ class Model(Component):
     def suited_to(self, start: Array, inputs: Array) -> Model:
         """The model with the substeps that ``integrator="auto"`` takes before there is a log; itself once it has some.
 
-        Warns where no number of substeps is enough.
-
         Args:
-            start: A state that matters, as the reference, ``(nx,)``.
-            inputs: Inputs that may be applied, ``(m, nu)``.
+            start: A state that matters, as the reference, ``(n_states,)``.
+            inputs: Inputs that may be applied, with usual signals beside them, ``(m, nu + n_signals)``.
         """
         if self.settled or self.ode is None:
             return self
         flow = Flow(self.ode, self.dt, self.space.theta)
         choice = choice_from(flow, start, inputs)
-        if not choice.enough:
-            logger.warning("A step of %g s of the model is not accurate: %s", self.dt, shortfall(choice))
-        return self.with_scheme(Scheme("rk4", choice.substeps))
+        return self._with_substeps(choice, "with the inputs that may be applied")
 
     def suited_to_log(self, table: Rows, *, finer: bool = False) -> Model:
         """The model with the substeps that ``integrator="auto"`` takes on a log; itself where another was asked for.
@@ -287,7 +304,13 @@ class Model(Component):
         if self.scheme.kind == "exact":
             return self.with_scheme(exact_scheme(self.ode, self.dt, self.space.theta, self.scheme))
         flow = Flow(self.ode, self.dt, self.space.theta)
-        choice = choice_on(flow, *sampled(table, self.layout.n_states), self.scheme.substeps if finer else 1)
+        choice = choice_on(flow, *sampled(table, self.layout), self.scheme.substeps if finer else 1)
+        return self._with_substeps(choice, "on this log")
+
+    def _with_substeps(self, choice: Choice, where: str) -> Model:
+        """The model with what was chosen; warns, once, where that is not enough."""
+        if advice := shortfall(choice):
+            warn_once(f"A step of {self.dt:g} s of the model {self!r} is not accurate {where}: {advice}")
         return self.with_scheme(Scheme("rk4", choice.substeps))
 
     def check(self, table: Rows) -> IntegrationCheck:
@@ -299,7 +322,7 @@ class Model(Component):
         if self.ode is None or self.scheme is None:
             return IntegrationCheck("map", 1, 0.0, 0.0, 0, "")
         flow, fixed = Flow(self.ode, self.dt, self.space.theta), self.integrator != "auto"
-        return checked(flow, self.scheme, self._plant_step, table, fixed=fixed)
+        return checked(flow, self.scheme, self._plant_step, table, self.layout, fixed=fixed)
 
     def _plant_step(self, x: Array, u: Array) -> Array:
         """The plant's states ``(B, n_states)`` after x, u acting."""
@@ -338,6 +361,7 @@ class Model(Component):
             "settled": self.settled,
             "delay": None if self.delay is None else list(self.delay),
             "previous": self.layout.has_previous,
+            "signals": [signal.to_json() for signal in self.layout.signals],
             "function": function_to_json(self.plant if self.ode is None else self.ode),
         }
 
@@ -349,14 +373,14 @@ class Model(Component):
             FileFormatError: If the function is damaged or of other shapes, or its integrator is none or not for it.
         """
         model = cls.__new__(cls)
-        layout = Layout.of(data["nx"], data["nu"], data["delay"])
+        layout = Layout.of(data["nx"], data["nu"], data["delay"], [Signal.from_json(s) for s in data["signals"]])
         if data["previous"]:
             layout = layout.with_previous()
         model.dt, model.delay = float(data["dt"]), None if data["delay"] is None else layout.delay
         if not (np.isfinite(model.dt) and model.dt > 0.0):
             raise FileFormatError("model.dt", expected="a positive number of seconds", actual=str(data["dt"]))
         model.space = blocks_from_json(data)
-        sizes = (layout.n_states, layout.nu, model.space.size)
+        sizes = (layout.n_states, len(layout.acting), model.space.size)
         function = function_from_json(data["function"], "model", inputs=sizes, output=layout.n_states)
         integrator, scheme = data["integrator"], None
         if integrator != "map":
@@ -368,3 +392,13 @@ class Model(Component):
         model.layout = layout
         model._take(function, integrator, scheme, settled=data["settled"] is True)
         return model
+
+
+def _takes_signals(dynamics: Callable[..., Any]) -> bool:
+    """Whether a function of the user takes signals as its fourth argument."""
+    try:
+        parameters = inspect.signature(dynamics).parameters.values()
+    except (TypeError, ValueError):  # of what is built in
+        return False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters) >= 4

@@ -16,6 +16,7 @@ from mpcoffline.core.types import Array
 from .component import COSTS, Component, blocks_from_json, difference, vector
 from .cost import QuadraticCost
 from .parameters import Block, Parameter, ParameterSpace
+from .signals import Named
 
 HIDDEN = (24, 24)  # widths that hold the value of a swing-up to a few percent
 _SMALL = 1e-3  # curvature that a convex network cost has by default besides the network's
@@ -136,7 +137,8 @@ class ConvexNetworkCost(QuadraticCost):
         R: Input weight of q, ``(nu, nu)``.
         mean: Centre of (x, u), ``(nx + nu,)``; zero by default.
         std: Scale of (x, u), ``(nx + nu,)``, positive; one by default.
-        **options: Further arguments of :class:`QuadraticCost`: ``S``, ``x_ref``, ``u_ref``, ``constant``, ``D``.
+        **options: Further arguments of :class:`QuadraticCost`: ``S``, ``x_ref``, ``u_ref``, ``constant``, ``D`` and
+            ``tracks``.
 
     Raises:
         InvalidArgumentError: If shapes do not fit, an entry of a U is negative, or [[W, S], [S', R]] is not positive
@@ -212,9 +214,9 @@ class ConvexNetworkCost(QuadraticCost):
             z = 0.5 * (a + ca.sqrt(a**2 + 1.0))
         return super()._stationary(x, u, p) + ca.mtimes(p[f"mixes_{self.n_layers - 1}"], z)
 
-    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX], d: Named | None = None) -> ca.SX:
         """Lhat(x, u_ref) as a CasADi scalar."""
-        return self.expression(x, p.get("u_ref", ca.SX(0, 1)), p)
+        return self._stationary(self._away(x, d), p.get("u_ref", ca.SX(0, 1)), p)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:

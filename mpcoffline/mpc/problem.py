@@ -33,6 +33,7 @@ from .expressions import scalar, traced
 from .layout import Layout
 from .model import Model
 from .parameters import Group, ParameterSpace
+from .seen import stage_expression, terminal_expression
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,9 @@ class MPC:
         object.__setattr__(self, "action_high", high)
         object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
         _ = self.stage_function, self.terminal_function  # dimensions are refused here, not at the first solve
-        object.__setattr__(self, "model", self.model.suited_to(self._rest(), self._extreme_inputs()))
+        inputs, usual = self._extreme_inputs(), self.layout.usual_signals[self.layout.present - self.layout.n_states]
+        inputs = np.hstack([inputs, np.tile(usual, (len(inputs), 1))])
+        object.__setattr__(self, "model", self.model.suited_to(self._rest()[: self.layout.n_states], inputs))
 
     def _bounds(self, name: str) -> Array:
         bounds = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))
@@ -157,16 +160,19 @@ class MPC:
 
     @property
     def reference(self) -> Array | None:
-        """The observation that the stage cost, else the terminal cost, pulls to, ``(ny,)``; None where neither says."""
-        values = self.values
+        """The plant's state that the stage cost, else the terminal cost, pulls to, ``(n_states,)``, or None.
+
+        Where a cost tracks a signal, that is the distance from it.
+        """
+        values, n = self.values, self.layout.n_states
         for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
-            if name in values and values[name].shape in ((self.ny,), (self.nx,)):
-                return values[name][: self.ny]
+            if name in values and values[name].shape in ((n,), (self.ny,), (self.nx,)):
+                return values[name][:n]
         return None
 
     def _rest(self) -> Array:
         """The reference; zero where there is none."""
-        return np.zeros(self.ny) if self.reference is None else self.reference
+        return np.zeros(self.layout.n_states) if self.reference is None else self.reference
 
     def _extreme_inputs(self) -> Array:
         """The input at rest, and with one input after another on its bounds, ``(1 + 2 nu, nu)``.
@@ -193,7 +199,7 @@ class MPC:
         """The states z ``(..., nx)`` of this problem for observations y ``(..., ny)``.
 
         Args:
-            y: Observations.
+            y: Observations; or the plant's states alone, ``(..., n_states)``, with usual signals.
             past: The memory ``(..., n_memory)`` in the order of ``layout.names``; :attr:`usual_input` by default.
 
         Raises:
@@ -201,6 +207,9 @@ class MPC:
         """
         observations, layout = np.asarray(y, dtype=np.float64), self.layout
         memory = layout.filled(self.usual_input) if past is None else np.asarray(past, dtype=np.float64)
+        if layout.signals and observations.shape[-1:] == (layout.n_states,):
+            usual = np.broadcast_to(layout.usual_signals, (*observations.shape[:-1], layout.ny - layout.n_states))
+            observations = np.concatenate([observations, usual], axis=-1)
         for name, array, size in (("y", observations, layout.ny), ("past", memory, layout.n_memory)):
             if array.ndim < 1 or array.shape[-1] != size:
                 raise InvalidArgumentError(name, expected=f"shape (..., {size})", actual=f"shape {array.shape}")
@@ -279,7 +288,7 @@ class MPC:
         """Lhat_theta as CasADi function ``(x, u, theta) -> cost``."""
         x, u, theta = self._symbols()
         p = self.stage_cost.space.symbols(self._part("stage_cost", theta))
-        cost = scalar("stage_cost", lambda: self._stage_expression(x, u, p), self.ny, self.nu)
+        cost = scalar("stage_cost", lambda: stage_expression(self.layout, self.stage_cost, x, u, p), self.ny, self.nu)
         return traced("stage_cost", ca.Function("stage_cost", [x, u, theta], [cost], ["x", "u", "theta"], ["cost"]))
 
     @cached_property
@@ -287,20 +296,10 @@ class MPC:
         """T_theta as CasADi function ``(x, theta) -> cost``."""
         x, _, theta = self._symbols()
         p = self.terminal_cost.space.symbols(self._part("terminal_cost", theta))
-        cost = scalar("terminal_cost", lambda: self._terminal_expression(x, p), self.ny, self.nu)
+        cost = scalar(
+            "terminal_cost", lambda: terminal_expression(self.layout, self.terminal_cost, x, p), self.ny, self.nu
+        )
         return traced("terminal_cost", ca.Function("terminal_cost", [x, theta], [cost], ["x", "theta"], ["cost"]))
-
-    def _stage_expression(self, z: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
-        cost: Any = self.stage_cost
-        before = [z[self.layout.previous.tolist()]] if getattr(cost, "uses_previous", False) else []
-        return ca.SX(cost.expression(self._seen_by(cost, z), u, p, *before))
-
-    def _terminal_expression(self, z: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
-        return self.terminal_cost.terminal_expression(self._seen_by(self.terminal_cost, z), p)
-
-    def _seen_by(self, cost: object, z: ca.SX) -> ca.SX:
-        """What a cost is a function of: the observation in z, or z where its ``nx`` says so."""
-        return z if getattr(cost, "nx", None) == self.nx else z[: self.ny]
 
     @cached_property
     def constraint_function(self) -> ca.Function | None:
@@ -349,8 +348,8 @@ class MPC:
         """
         return {
             "model": self.model.to_json(),
-            "stage_cost": cost_to_json(self.stage_cost, self._stage_expression, self.nx, self.nu, portable=portable),
-            "terminal_cost": cost_to_json(self.terminal_cost, self._terminal_expression, self.nx, portable=portable),
+            "stage_cost": cost_to_json(self.stage_cost, self.layout, stage=True, portable=portable),
+            "terminal_cost": cost_to_json(self.terminal_cost, self.layout, stage=False, portable=portable),
             "horizon": self.horizon,
             "discount": self.discount,
             "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],

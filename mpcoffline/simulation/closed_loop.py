@@ -11,6 +11,7 @@ from mpcoffline.control.course import Course
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc.layout import Layout
 from mpcoffline.solvers import Plan
 
 from .ensemble import Ensemble
@@ -46,7 +47,13 @@ class Simulation:
 
 
 def simulate(
-    policy: MPCPolicy, ensemble: Ensemble, cost: LoggedCost, table: TransitionTable, starts: Array, n_steps: int
+    policy: MPCPolicy,
+    ensemble: Ensemble,
+    cost: LoggedCost,
+    table: TransitionTable,
+    starts: Array,
+    n_steps: int,
+    signals: Array | None = None,
 ) -> Simulation:
     """Runs a controller on all members from all starts; all MPCs of a step are solved in one batch.
 
@@ -60,13 +67,15 @@ def simulate(
         table: The data, for scales.
         starts: ``(starts, nx)``: observations, and the past inputs that the table's states hold.
         n_steps: Length of an episode.
+        signals: What comes from outside after each step, ``(starts, n_steps, ny - n_states)``, see
+            :func:`signals_along`; none by default.
     """
     columns = table.values()
     middle, spread = columns.observations.mean(axis=0), columns.observations.std(axis=0)
     reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread
     reach = np.where(spread > 0.0, reach, np.inf)
     dearest = float(columns.costs.max())
-    ny = policy.mpc.ny
+    ny, outside = policy.mpc.ny, slice(policy.mpc.layout.n_states, policy.mpc.ny)
     n, (s, nx) = len(ensemble), starts.shape
     x = np.broadcast_to(starts, (n, s, nx)).copy()
     lost = np.zeros((n, s), dtype=bool)
@@ -74,7 +83,7 @@ def simulate(
     course: Plan | Course | None = None
     if policy.mpc.nx == nx > ny:  # the policy knows what was applied before, as it would in the midst of an episode
         course = Course(*Plan.none(n * s, policy.mpc), x.reshape(-1, nx)[:, ny:])
-    for _ in range(n_steps):
+    for k in range(n_steps):
         flat = x.reshape(-1, nx)
         u, course = policy.predict(flat[:, :ny], state=course)
         u = np.asarray(u, dtype=np.float64)
@@ -83,6 +92,8 @@ def simulate(
         reached = ensemble.step(x, u.reshape(n, s, -1))
         lost |= ~(np.abs(reached - middle) < reach).all(axis=2)
         x = np.where(lost[:, :, None], x, reached)
+        if signals is not None:
+            x[:, :, outside] = signals[:, k]
         states.append(x[0].copy())
         actions.append(u.reshape(n, s, -1)[0])
     each = np.stack(costs, axis=2)
@@ -97,10 +108,33 @@ def simulate(
     )
 
 
-def initial_states(table: TransitionTable, count: int, seed: int) -> Array:
-    """Where the log's own episodes began, at random; further states of the log where there are too few episodes."""
+def initial_rows(table: TransitionTable, count: int, seed: int) -> NDArray[np.intp]:
+    """Rows in which the log's own episodes began, at random; further rows where there are too few episodes."""
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(table.episodes.firsts)[:count]
     if len(chosen) < count:
         chosen = np.concatenate([chosen, rng.integers(len(table), size=count - len(chosen))])
-    return np.asarray(table.take(np.sort(chosen)).observations, dtype=np.float64)
+    return np.sort(chosen)
+
+
+def initial_states(table: TransitionTable, count: int, seed: int) -> Array:
+    """The states in these rows, ``(count, nx)``."""
+    return np.asarray(table.take(initial_rows(table, count, seed)).observations, dtype=np.float64)
+
+
+def signals_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int, layout: Layout) -> Array:
+    """The signals that were logged after some rows, ``(count, n_steps, ny - n_states)``: one after each step.
+
+    Where an episode ends before, its signals go on as they would along a horizon.
+    """
+    n, ny, length = layout.n_states, layout.ny, len(table)
+    moved = layout.sources[: ny - n] - n
+    reached, ids = table.next_observations[:, n:ny], table.episode_ids
+    now = np.asarray(table.observations[rows, n:ny], dtype=np.float64)
+    found, goes_on = [], np.ones(len(rows), dtype=bool)
+    for k in range(n_steps):
+        row = np.minimum(rows + k, length - 1)
+        goes_on &= (rows + k < length) & (ids[row] == ids[rows])
+        now = np.where(goes_on[:, None], reached[row], now[:, moved])
+        found.append(now)
+    return np.stack(found, axis=1)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from mpcoffline.mpc.integrators import rk4_expression
 from mpcoffline.mpc.layer_steps import Dense, Map, Node, Scalars
 from mpcoffline.mpc.layers import Layered, layered
-from mpcoffline.mpc.model import rk4_expression
 
 
 def silu(x: ca.SX) -> ca.SX:

@@ -35,7 +35,7 @@ class BellmanProblem:
 
     def __init__(self, mpc: MPC, value: ValueFunction, unit: float, cost: KnownCost | None = None) -> None:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
-        self.n_states = mpc.layout.n_states
+        self.n_states, self._ny = mpc.layout.n_states, mpc.ny
         self._value, self._discount, self.unit = value, mpc.discount, unit
         self._scale = 1.0 if cost is None else cost.scale
 
@@ -51,9 +51,12 @@ class BellmanProblem:
         return target
 
     def predicted(self, batch: Columns, theta: Tensor) -> Tensor:
-        """The predicted successor f_th(s,a), ``(B, ny)``."""
+        """The predicted successor f_th(s,a), ``(B, ny)``; signals, which no model predicts, are those of s+."""
         reached: Tensor = self._f(batch.observations.double(), batch.actions.double(), theta)
-        return reached
+        n, ny = self.n_states, self._ny
+        if n == ny:
+            return reached
+        return torch.cat([reached[:, :n], batch.next_observations[:, n:ny].double(), reached[:, ny:]], dim=1)
 
     def predicted_value(self, batch: Columns, theta: Tensor) -> Tensor:
         """The discounted value of the predicted successor, gamma V(f_th(s,a)), ``(B,)``."""
