@@ -17,6 +17,7 @@ from .datasets import (
     load_dataset as load_dataset,
 )
 from .diagnostics import diagnose as diagnose
+from .estimation.consistency import check as check
 from .gallery import collect as collect
 from .learner.learner import OfflineMPCLearner as OfflineMPCLearner
 from .mpc import (

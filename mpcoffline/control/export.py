@@ -64,7 +64,9 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
         )
     options = policy.solver_options if policy.solver_name == "ddp" else {}
     solver = DDPSolver(mpc, **options)
-    rows = _vectors(MPCPolicy(mpc, "ddp", **options))
+    rows = _vectors(
+        MPCPolicy(mpc, "ddp", **(options | {"round_corners": False}))
+    )  # as the C, which has no corners rounded
     test = _TEST.replace("@RANGES@", ", ".join(map(_number, _ranges(mpc, rows))))
     vectors = "".join(" ".join([str(int(reset)), *map(_number, row)]) + "\n" for reset, *row in rows)
     texts = (_header(mpc, solver), _source(mpc, solver), test, vectors or "\n", _CMAKE)

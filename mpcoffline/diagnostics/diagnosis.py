@@ -94,7 +94,8 @@ def diagnose(
     found = identify(nominal, table, seed=seed)
     clean, identified = found.table, nominal.replace(model=found.model)
     ensemble = Ensemble(identified, clean, found, seed=seed)
-    cost = LoggedCost(clean, seed, None if learned.layout.has_previous else learned.ny)
+    seen = None if learned.layout.has_previous else learned.ny
+    cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
     rows = initial_rows(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
     starts, signals = clean.take(rows).values().observations, signals_along(clean, rows, n_steps, learned.layout)

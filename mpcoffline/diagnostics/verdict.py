@@ -17,6 +17,7 @@ Verdict = Literal["recommend", "try with care", "keep MPC_1"]
 _WORST = 0.98  # the largest relative cost of any member that may be recommended
 _DISAGREEMENT = 0.5  # what is asked for besides, per log(max / min) of the members
 _CARE = 0.95  # relative cost with the identified model below which a trial is worth it
+_BELOW = 0.1  # of the range of all mean costs
 _MUCH_NOISE = 0.12  # of the states' spread
 _FEW_ROWS = 500
 _LITTLE_NOISE = 0.02  # where rows are few
@@ -52,8 +53,10 @@ class Comparison:
     @classmethod
     def of(cls, nominal: Simulation, learned: Simulation, cost_r2: float) -> Comparison:
         """From the simulations of both."""
-        # A controller may become cheaper than anything logged: then that is the zero of both.
-        low = min(0.0, float(nominal.mean_cost.min()), float(learned.mean_cost.min()))
+        # A controller may become cheaper than anything logged, and costs have no zero of their own: then ratios are
+        # taken from a tenth of the range below the cheapest of both.
+        low, high = (float(f([f(each.mean_cost) for each in (nominal, learned)])) for f in (np.min, np.max))
+        low = 0.0 if low >= 0.0 else low - _BELOW * (high - low)
         floor = 1e-9 * max(float(nominal.mean_cost.max()), 1e-300)
         return cls(
             nominal_cost=tuple(float(v) for v in np.maximum(nominal.mean_cost - low, floor)),

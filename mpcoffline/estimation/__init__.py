@@ -5,16 +5,23 @@ from __future__ import annotations
 from .delays import DelaySearch, find_delays
 from .identification import IdentificationConfig
 from .identifying import Identification, identify
+from .residual import Residual, fit_residual, fit_residuals, with_residual
 from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
+from .structure import MultiStepCheck
 
 __all__ = [
     "DelaySearch",
     "Identification",
     "IdentificationConfig",
+    "MultiStepCheck",
     "NoiseEstimate",
+    "Residual",
     "estimate_noise",
     "find_delays",
+    "fit_residual",
+    "fit_residuals",
     "identify",
     "smooth",
     "with_measurement_noise",
+    "with_residual",
 ]

@@ -28,10 +28,12 @@ from .uncertainty import Misfit, clusters, uncertainty
 logger = logging.getLogger(__name__)
 
 FULL_TURN = 2.0 * np.pi
+#: Spreads of the increments: what a prediction that is not finite counts, and from where on errors count by less.
+ABSURD = 1e3
 _NEAR_TURN = 0.5  # rad
+_MOST_TURNS = 10  # a step; beyond 1e16, every number is one of full turns
 _AT_BOUND = 1e-4  # in scaled coordinates
 _WEAKEST_PRIOR = 1e-10
-_ABSURD = 1e3  # spreads of the increments: what a prediction that is not finite counts; beyond, errors count by less
 _FEW_ROWS = 1_000  # for the way to the minimum
 _PRIOR_ROUNDS = 3  # until sigma^2, which begins at 1, is that of the minimum
 _MAX_ENTRIES = 20_000_000  # of the Jacobian: 160 MB
@@ -187,8 +189,8 @@ class OneStepProblem:
         errors = (predicted - self.rows.reached) / self.scale
         jacobian = slopes[:, :, self.free] * self.slopes(z) / self.scale[:, None]
         finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
-        errors, jacobian = np.where(finite, errors, _ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
-        beyond = np.maximum(np.abs(errors) / _ABSURD, 1.0)
+        errors, jacobian = np.where(finite, errors, ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
+        beyond = np.maximum(np.abs(errors) / ABSURD, 1.0)
         if (beyond > 1.0).any():
             errors, jacobian = errors * (1.0 + np.log(beyond)) / beyond, jacobian / beyond[:, :, None]
         return errors, jacobian
@@ -312,7 +314,7 @@ def described(
     """
     theta = np.clip(problem.theta(z), mpc.space.low, mpc.space.high)
     errors = problem.errors(theta)
-    absurd = int(np.sum(~(np.abs(errors) <= _ABSURD).all(axis=1)))
+    absurd = int(np.sum(~(np.abs(errors) <= ABSURD).all(axis=1)))
     covariance, undetermined = uncertainty(misfit, z, (problem.low, problem.high), spread, problem.names)
     deviation = np.zeros_like(theta)
     identified = np.flatnonzero(problem.coordinates.mask)[problem.free]
@@ -349,7 +351,7 @@ def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
     """
     turns = np.round(np.nan_to_num(errors) / FULL_TURN)
     jumps = turns != 0.0
-    near = np.abs(errors - FULL_TURN * turns) < _NEAR_TURN
+    near = (np.abs(errors - FULL_TURN * turns) < _NEAR_TURN) & (np.abs(turns) <= _MOST_TURNS)
     confined = np.ptp(np.concatenate([rows.x, rows.reached]), axis=0) <= 1.05 * FULL_TURN
     count = jumps.sum(axis=0)
     wrapped = confined & (count > 0) & ((jumps & near).sum(axis=0) >= 0.9 * count)
@@ -378,7 +380,8 @@ def _best_descent(
             break
         start = 0.5 * config.prior_spread * rng.standard_normal(len(start))
     for _ in range(_PRIOR_ROUNDS):
-        prior = weight(float(np.sum(few.linearised(best.z)[0] ** 2)) / len(few.rows.x))
+        errors = few.linearised(best.z)[0]
+        prior = weight(float(np.sum(np.where(np.abs(errors) < ABSURD, errors, 0.0) ** 2)) / len(few.rows.x))
         best = few.descend(best.z, prior, config.max_iterations)
     return problem.descend(best.z, prior, config.max_iterations).z, prior
 
@@ -389,5 +392,5 @@ def _at_bound(problem: OneStepProblem, z: Array) -> NDArray[np.bool_]:
 
 def _root_mean_square(errors: Array) -> Array:
     """Of each coordinate ``(nx,)``, whatever the model predicts."""
-    finite = np.nan_to_num(errors, nan=_ABSURD, posinf=_ABSURD, neginf=-_ABSURD)
-    return np.asarray(np.sqrt(np.mean(np.clip(finite, -_ABSURD, _ABSURD) ** 2, axis=0)))
+    finite = np.nan_to_num(errors, nan=ABSURD, posinf=ABSURD, neginf=-ABSURD)
+    return np.asarray(np.sqrt(np.mean(np.clip(finite, -ABSURD, ABSURD) ** 2, axis=0)))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mpcoffline.core.checks import check_integers
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -20,6 +22,7 @@ from .identification import (
     identify_plant,
 )
 from .kalman import Filtered, filtered, smoothed
+from .multi_step import MultiStepProblem, Windows
 from .plant import plant_rows, state_rows
 from .smoothing import (
     FEW_ROWS,
@@ -30,6 +33,7 @@ from .smoothing import (
     smoothed_plant,
     with_likely_process,
 )
+from .structure import MultiStepCheck, check_structure
 from .trajectories import Trajectories
 from .uncertainty import Misfit, clusters
 
@@ -49,15 +53,24 @@ class Identification(OneStepIdentification):
         table: The smoothed data; the given table itself where its noise is negligible.
         noise: The noise found.
         model: The identified model, integrated as accurately as the log asks for.
+        multi_step: How well the model predicts many steps, and whether other parameters would do so better, which says
+            that its structure is wrong; None where the log has no stretches long enough.
     """
 
     table: TransitionTable
     noise: NoiseEstimate
     model: Model
+    multi_step: MultiStepCheck | None = None
 
 
 def identify(
-    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+    mpc: MPC,
+    table: TransitionTable,
+    config: IdentificationConfig | None = None,
+    *,
+    horizon: int | None = None,
+    tried: Sequence[str] = (),
+    seed: int = 0,
 ) -> Identification:
     """Identifies the model from a log, and takes the measurement noise out of the log.
 
@@ -73,10 +86,21 @@ def identify(
     theta_0; then all is done again, from theta_0, with as many: a coarse Runge-Kutta step has the same one-step error
     at another, wrong time constant, and the data would seem sure of it.
 
+    With ``horizon``, the parameters that predict so many steps open loop best, from starts that are fitted, too (output
+    error, :class:`~mpcoffline.estimation.multi_step.MultiStepProblem`). With the right structure that gains nothing;
+    with a wrong one it predicts farther, and controllers on it were no better.
+
+    Example:
+        >>> found = mpcoffline.estimation.identify(mpc, table)
+        >>> better = mpc.with_theta(found.theta)
+        >>> print(found.multi_step)
+
     Args:
         mpc: The MPC; its parameters are theta_0, and all but those of the model stay as they are.
         table: The transitions, in the order of time within each episode. Rows that were left out are gaps.
         config: Prior and effort.
+        horizon: Steps that are predicted in the fit; None for one, 10 to 25 for output error.
+        tried: What of the model's structure was varied before, in words: the check of structure repeats it.
         seed: Seeds the choice of rows and the restarts.
 
     Returns:
@@ -86,21 +110,42 @@ def identify(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     config = config or IdentificationConfig()
+    if horizon is not None:
+        check_integers(1, horizon=horizon)
     whole = state_rows(mpc, table)
     rows = plant_rows(mpc, whole)
-    mpc = mpc.replace(model=mpc.model.suited_to_log(rows))
+    mpc = mpc.replace(
+        model=mpc.model.suited_to_log(rows, finer=True)
+    )  # rows may have been left out since it was chosen
     for _ in range(_ROUNDS):
-        found = _identified(mpc, rows, config, seed)
+        found = _identified(mpc, rows, config, horizon, seed)
         model = found.model.suited_to_log(rows, finer=True)
         if model.scheme == found.model.scheme:
             break
         logger.info("Identified again: at what was found, %s is not accurate, %s is.", found.model.scheme, model.scheme)
         mpc = mpc.replace(model=model.with_theta(mpc.model.space.theta))
     found.warn()
-    return replace(found, table=whole if found.table is rows else with_plant_states(whole, found.table))
+    check = _checked(mpc, rows, found, config, seed)
+    if check is not None:
+        substeps = () if found.model.integrator != "auto" else (f"the integrator ({found.model.scheme} is accurate)",)
+        check = check.having_tried(*tried, *substeps)
+        logger.log(logging.WARNING if check.suspicious else logging.INFO, "%s", check)
+    table = whole if found.table is rows else with_plant_states(whole, found.table)
+    return replace(found, table=table, multi_step=check)
 
 
-def _identified(mpc: MPC, table: TransitionTable, config: IdentificationConfig, seed: int) -> Identification:
+def _checked(
+    mpc: MPC, rows: TransitionTable, found: Identification, config: IdentificationConfig, seed: int
+) -> MultiStepCheck | None:
+    """The check of structure, on the rows as logged."""
+    source = excerpt(rows, seed)
+    few = Trajectories.of(mpc, source, found.unwrapped).thinned(FEW_ROWS, seed)
+    return check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
+
+
+def _identified(
+    mpc: MPC, table: TransitionTable, config: IdentificationConfig, horizon: int | None, seed: int
+) -> Identification:
     """As :func:`identify`, from a table of :func:`plant_rows`, with the model integrated as it is."""
 
     def result(found: OneStepIdentification, table: TransitionTable, noise: NoiseEstimate) -> Identification:
@@ -111,28 +156,48 @@ def _identified(mpc: MPC, table: TransitionTable, config: IdentificationConfig, 
     source = excerpt(table, seed)
     few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)
-    if noise.source == "unknown" or noise.negligible:
+    silent = noise.source == "unknown" or noise.negligible
+    if silent and horizon is None:
         return result(first, table, noise)
-    z, noise, misfit = _most_likely(mpc, few, first, config, (table, source))
-    logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
     centre = table.centring.centre[: table.ny]
     noisy = OneStepProblem(mpc, few.rows(), centre)
-    smoothed_table = smoothed_plant(mpc, table, noisy.theta(z), noise, first.unwrapped)
-    clean = Trajectories.of(mpc, excerpt(smoothed_table, seed), first.unwrapped)
-    problem = OneStepProblem(mpc, clean.rows(), centre, noisy.coordinates)
-    return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), smoothed_table, noise)
+    z, misfit = noisy.z(first.theta), Misfit.nothing()
+    if not silent:
+        z, noise, misfit = _most_likely(few, noisy, first, config, source)
+        logger.info("Measurement noise of %.1f %%: identified and smoothed with a Kalman filter.", 100.0 * noise.level)
+    if horizon is not None and len(z):
+        z, misfit = _predicting_far(mpc, few, noisy, (np.zeros_like(z), z), horizon, config, source)
+    clean = table if silent else smoothed_plant(mpc, table, noisy.theta(z), noise, first.unwrapped)
+    rows = Trajectories.of(mpc, excerpt(clean, seed), first.unwrapped).rows()
+    problem = OneStepProblem(mpc, rows, centre, noisy.coordinates)
+    return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), clean, noise)
+
+
+def _predicting_far(
+    mpc: MPC,
+    few: Trajectories,
+    coordinates: OneStepProblem,
+    begin: tuple[Array, ...],
+    horizon: int,
+    config: IdentificationConfig,
+    source: TransitionTable,
+) -> tuple[Array, Misfit]:
+    """The parameters that predict many steps best, from the best first guess, and what the data say of them."""
+    windows = Windows.of(few, horizon, horizon, full=False)
+    problem = MultiStepProblem(mpc, windows, coordinates, config.prior_spread)
+    ends = [problem.fitted(z, config.max_iterations) for z in begin]
+    z, starts, there = min(ends, key=lambda end: end[2].cost)
+    return z, problem.misfit(z, starts, there, source.episode_ids[windows.rows])
 
 
 def _most_likely(
-    mpc: MPC,
     few: Trajectories,
+    coordinates: OneStepProblem,
     first: OneStepIdentification,
     config: IdentificationConfig,
-    tables: tuple[TransitionTable, TransitionTable],
+    source: TransitionTable,
 ) -> tuple[Array, NoiseEstimate, Misfit]:
     """The parameters of the largest likelihood and prior, the noise, and what the data say about the parameters."""
-    table, source = tables
-    coordinates = OneStepProblem(mpc, few.rows(), table.centring.centre[: table.ny])
     z, noise = coordinates.z(first.theta), noise_by_moments(few, first.theta)
     about = few.measured
     for _ in range(_ROUNDS):

@@ -24,8 +24,10 @@ from .kalman import Linearised, filtered, smoothed
 from .plant import plant_rows, state_rows
 from .trajectories import Trajectories
 
-#: Noise below this share of a coordinate's standard deviation is left in the data: it harms nothing.
+#: Noise below this share of a coordinate's standard deviation is left in the data: it harms nothing,
 NEGLIGIBLE = 0.01
+#: provided that it is below this share of the increments', too: a slow plant is sampled often.
+NEGLIGIBLE_STEP = 0.03
 
 FEW_ROWS = 20_000  # on which the model is identified
 _FEWEST_PAIRS = 30  # of consecutive rows, for an estimate of the noise
@@ -50,12 +52,14 @@ class NoiseEstimate:
         source: What the estimate rests on: ``"repeated"`` where the data measure every state twice (s+ of a row and s
             of the next), ``"innovations"`` where these are one number, ``"unknown"`` where too few rows are
             consecutive.
+        increments: Standard deviation of the increment of each coordinate, ``(nx,)``; None where unknown.
     """
 
     measurement: Array
     process: Array
     spread: Array
     source: Literal["repeated", "innovations", "unknown"]
+    increments: Array | None = None
 
     @property
     def levels(self) -> Array:
@@ -72,7 +76,8 @@ class NoiseEstimate:
     @property
     def negligible(self) -> bool:
         """Whether the data may be used as they are."""
-        return self.level < NEGLIGIBLE
+        slow = self.increments is not None and bool((self.measurement > NEGLIGIBLE_STEP * self.increments).any())
+        return self.level < NEGLIGIBLE and not slow
 
 
 def with_measurement_noise(table: TransitionTable, level: float, seed: int) -> TransitionTable:
@@ -179,7 +184,8 @@ def noise_by_moments(problem: Trajectories, theta: Array) -> NoiseEstimate:
     passed_on = np.einsum("nij,j->i", F**2, variances) / len(F)
     process = np.sqrt(np.maximum(np.mean(errors**2, axis=0) - variances - passed_on, 0.0))
     source: Literal["repeated", "innovations"] = "repeated" if problem.repeated else "innovations"
-    return NoiseEstimate(scale * np.sqrt(variances), scale * process, problem.spread, source)
+    increments = (problem.reached - problem.s)[valid].std(axis=0)
+    return NoiseEstimate(scale * np.sqrt(variances), scale * process, problem.spread, source, increments)
 
 
 def _lagged_variances(problem: Trajectories, errors: Array, F: Array) -> Array:

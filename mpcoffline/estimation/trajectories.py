@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.scaling import spread_of
+from mpcoffline.mpc.scaling import increments_scale, spread_of
 
-from .identification import Rows
+from .identification import ABSURD, Rows
 from .kalman import Linearised
 from .one_step import OneStep
 
@@ -104,15 +104,16 @@ class Trajectories:
     def linearised(self, theta: Array, about: Array) -> Linearised:
         """The filter's data with the model linearised about states ``(T + 1, E, nx)`` in the filter's units.
 
-        Where the model is not finite, the trajectory is taken to stand still there.
+        Where the model is not finite, or moves by more than 1000 spreads of the increments, the trajectory is taken to
+        stand still.
         """
         steps, n = self.valid.T.shape
         x, u = about[:-1].reshape(-1, len(self.scale)), self.inputs.swapaxes(0, 1).reshape(steps * n, -1)
         ahead, slopes, F = self.model.linearised(x * self.scale, u, theta)
         ahead, slopes, F = ahead / self.scale, slopes / self.scale[:, None], F * self.scale / self.scale[:, None]
-        bad = ~np.isfinite(np.concatenate([part.reshape(len(x), -1) for part in (ahead, slopes, F)], axis=1)).all(
-            axis=1
-        )
+        numbers = np.concatenate([part.reshape(len(x), -1) for part in (ahead, slopes, F)], axis=1)
+        farthest = ABSURD * increments_scale(self.s[self.valid], self.reached[self.valid]) / self.scale
+        bad = ~(np.isfinite(numbers).all(axis=1) & (np.abs(ahead - x) <= farthest).all(axis=1))
         ahead[bad], slopes[bad], F[bad] = x[bad], 0.0, np.eye(len(self.scale))
         parts = (part.reshape(steps, n, *part.shape[1:]) for part in (ahead, F, slopes))
         counts = self.counts if self.repeated else np.minimum(self.counts, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
@@ -17,6 +18,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 
@@ -33,6 +35,8 @@ Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
 #: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
 #: ends the fit there. One with a method ``on_fit_end()`` has it called when the fit ends, for whatever reason.
 Callback = Callable[["OfflineMPCLearner", int, int], Any]
+
+logger = logging.getLogger(__name__)
 
 _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
 
@@ -144,6 +148,8 @@ class OfflineMPCLearner:
     ) -> History:
         """Learns, stage by stage: by all presets V_phi, then theta.
 
+        First :func:`mpcoffline.check` compares the MPC with the data, and what it finds likely is logged as a warning.
+
         Args:
             dataset: A Minari data set, the id of one, or a table of transitions.
             n_steps: Gradient steps of (VALUE), by far the longest part; the method's by default.
@@ -163,7 +169,8 @@ class OfflineMPCLearner:
             ``fit_loss``.
 
         Raises:
-            InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds.
+            InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds, or
+                :func:`mpcoffline.check` is certain of a contradiction.
             InvalidArgumentError: If the checkpoint is of another fit, the given V_phi of another discount, or
                 ``dataset`` something else.
             UnknownIdError: For an unknown data set id.
@@ -198,6 +205,10 @@ class OfflineMPCLearner:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
         method = self.method if n_steps is None else self.method.replaced({"value_n_steps": n_steps})
         table, observation_space = self._table(dataset)
+        report = check(self.nominal_mpc, table)
+        report.raise_for_errors()
+        for finding in report.warnings:
+            logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)

@@ -111,7 +111,7 @@ class Run:
         known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
         table = with_memory(known.table, known.mpc.layout)
         n = known.mpc.layout.n_states
-        return replace(known, table=innermost(table, self.method.trim, self._mpc.discount, n))
+        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n))
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

@@ -52,15 +52,12 @@ def ends_matter(table: TransitionTable, discount: float) -> bool:
     return priced or float(own.mean()) > goes_on + size
 
 
-def innermost(table: TransitionTable, fraction: float, discount: float, ny: int) -> TransitionTable:
-    """The table without the rows that are farthest out in ny coordinates (:meth:`TransitionTable.trim`).
-
-    All of it where ends matter.
-    """
+def innermost(table: TransitionTable, fraction: float, discount: float, count: int | None = None) -> TransitionTable:
+    """The table without the farthest rows (:meth:`TransitionTable.trim`); all of it where ends matter."""
     if fraction < 1.0 and ends_matter(table, discount):
         _log.info("Episodes end at a price: no rows are left out, as ends lie far out")
         return table
-    return table.trim(fraction, ny)
+    return table.trim(fraction, count)
 
 
 def priced_ends(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> Ends | None:

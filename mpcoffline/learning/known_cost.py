@@ -59,7 +59,7 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     """What is known of the stage cost, from the rows as they were logged: smoothed ones would blur it."""
     if config.stage_cost == "fitted":
         return known
-    rows = _excerpt(known.table, known.seed)
+    rows = excerpt(known.table, known.seed)
     found = known_cost(known.mpc, rows)
     if found is None and config.stage_cost == "auto":
         other = _with_fitted_weights(known.mpc, rows)
@@ -79,10 +79,11 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
         )
     if found.constant:
         _log.warning(
-            "%s: the logged cost is %g in every transition that does not end an episode: it says when episodes end, "
-            "but not what is better before; stage and terminal cost stay the given ones, and the model is learned",
+            "%s: all costs are %g, so they do not tell what is good%s; stage and terminal cost stay the given ones, "
+            "and the model is learned",
             known.table.name,
             found.offset,
+            ", but that episodes should not end, or should" if np.any(known.table.terminations) else "",
         )
     return replace(known, cost=found)
 
@@ -233,7 +234,7 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     return mpc.with_theta(with_level(mpc, fitted, float(missed(fitted).mean())))
 
 
-def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
+def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
     """The table, or of a large one some stretches of consecutive rows."""
     n_blocks, wanted = -(-len(table) // _BLOCK), _ROWS // _BLOCK
     if n_blocks <= wanted:

@@ -33,6 +33,8 @@ class FitResult:
         loss_after: The same at theta.
         at_bounds: Names of the learned parameters that ended on a bound.
         potential: The potential that was fitted with the cost, if one was.
+        residual_share: The share of what the identified model missed that a learned residual explains; None where the
+            model has none.
     """
 
     theta: NDArray[np.float64]
@@ -40,6 +42,7 @@ class FitResult:
     loss_after: float
     at_bounds: tuple[str, ...] = ()
     potential: Potential | None = None
+    residual_share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description, without theta."""
@@ -48,6 +51,7 @@ class FitResult:
             "loss_after": self.loss_after,
             "at_bounds": list(self.at_bounds),
             "potential": None if self.potential is None else self.potential.to_json(),
+            "residual_share": self.residual_share,
         }
 
     @classmethod
@@ -55,7 +59,8 @@ class FitResult:
         """The inverse of :meth:`to_json`."""
         potential = None if data["potential"] is None else Potential.from_json(data["potential"])
         at_bounds = tuple(map(str, data["at_bounds"]))
-        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential)
+        share = None if data["residual_share"] is None else float(data["residual_share"])
+        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential, share)
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,8 @@ class Known:
         cost: How the logged costs follow from the MPC's stage cost, which then is not learned; None where it is.
         model_error: What the model misses in one step, as share of an increment (root mean square); None where it was
             not identified.
+        residual_share: The share of what the identified model missed that a learned residual explains; None where the
+            model has none.
         result: What the fit found; the last stage leaves one.
     """
 
@@ -112,6 +119,7 @@ class Known:
     value_function: ValueFunction | None = None
     cost: KnownCost | None = None
     model_error: float | None = None
+    residual_share: float | None = None
     result: FitResult | None = None
     given: MPC | None = None
 

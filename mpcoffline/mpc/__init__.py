@@ -6,6 +6,7 @@ from .component import COSTS, StageCost, TerminalCost
 from .constraints import CONSTRAINTS, AnyConstraint, Constraint, Penalty, StateBounds
 from .cost import NormCost, QuadraticCost
 from .expression_cost import ExpressionCost
+from .integration_check import IntegrationCheck
 from .lifted import LiftedCost, polynomial_features
 from .model import Model
 from .networks import ConvexNetworkCost, NetworkCost
@@ -22,6 +23,7 @@ __all__ = [
     "Constraint",
     "ConvexNetworkCost",
     "ExpressionCost",
+    "IntegrationCheck",
     "LiftedCost",
     "Model",
     "NetworkCost",

@@ -25,6 +25,7 @@ _UNARY = (  # noqa: SIM905 -- one per line would fill the page
 _BINARY = (  # noqa: SIM905
     "add and atan2 constpow copysign div eq fmax fmin fmod hypot if_else_zero le lt mul ne or pow remainder sub"
 ).split()
+_STEPS = "and ceil eq floor fmod le lt ne not or remainder sign".split()  # noqa: SIM905
 _CODES: dict[str, int] = {name: getattr(ca, f"OP_{name.upper()}") for name in (*_UNARY, *_BINARY)}
 _NAMES = {code: name for name, code in _CODES.items()}
 _BINARY_CODES = {_CODES[name] for name in _BINARY}
@@ -89,6 +90,28 @@ def traced(name: str, function: ca.Function) -> ca.Function:
             hint="Use casadi.sin ... instead of math.sin, which turns symbols into NaN.",
         )
     return function
+
+
+def is_affine(function: ca.Function, n: int = 2) -> bool:
+    """Whether the first output is affine in the first ``n`` inputs, whatever the others are.
+
+    Steps, as ``sign(x)`` or ``x > 1``, have zero derivatives and are not affine.
+    """
+    symbols = [ca.SX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
+    z = ca.vertcat(*(ca.vec(symbol) for symbol in symbols[:n]))
+    if ca.depends_on(ca.jacobian(ca.vec(function.call(symbols)[0]), z), z):
+        return False
+    varying: set[int] = set()
+    for op, sources, targets, _ in instructions(expanded(function)):
+        if op in (ca.OP_CONST, ca.OP_INPUT):
+            varies = op == ca.OP_INPUT and sources[0] < n
+        elif op != ca.OP_OUTPUT:
+            varies = not varying.isdisjoint(sources if _NAMES.get(op) not in _UNARY else sources[:1])
+            if varies and _NAMES.get(op) in _STEPS:
+                return False
+        if op != ca.OP_OUTPUT:
+            (varying.add if varies else varying.discard)(targets[0])
+    return True
 
 
 def scalar(name: str, expression: Callable[[], ca.SX], nx: int, nu: int) -> ca.SX:

@@ -12,6 +12,7 @@ from mpcoffline.core.types import Array
 
 from .integrators import Scheme
 from .layout import Layout
+from .scaling import increments_scale
 from .substeps import Choice, Flow, choice_on, relative
 
 ROWS = 2_000  # of a log that are looked at
@@ -88,7 +89,7 @@ def checked(
     x, u, reached = x[known], u[known], reached[known]
     exact = scheme.kind == "exact"
     truth = flow.exact(x, u) if exact else flow(x, u, max(_FINER * scheme.substeps, _FINEST))
-    errors = relative(step(x, u) - truth, (reached - x).std(axis=0)) if len(x) else np.zeros(1)
+    errors = relative(step(x, u) - truth, increments_scale(x, reached)) if len(x) else np.zeros(1)
     typical, largest = (float(np.quantile(errors, q, method="higher")) for q in (0.99, 1.0))
     advice = "" if exact else _advice(choice_on(flow, x, u, reached), scheme, fixed=fixed)
     if not known.all():
@@ -109,20 +110,23 @@ def sampled(rows: Rows, layout: Layout) -> tuple[Array, Array, Array]:
 
 def _advice(choice: Choice, scheme: Scheme, *, fixed: bool) -> str:
     """What to do about the errors on a log; nothing where the scheme is as good as what the log asks for."""
+    text = ""
     if choice.substeps > scheme.substeps:
         how = f"take integrator='rk4:{choice.substeps}', or 'auto'" if fixed else "fit takes them"
-        return f"The log asks for {choice.substeps} substeps: {how}."
-    return "" if choice.enough else shortfall(choice)
+        text = f"The log asks for {choice.substeps} substeps: {how}."
+    return f"{text} {shortfall(choice)}".strip()
 
 
 def shortfall(choice: Choice) -> str:
-    """What to do where no number of substeps is enough."""
-    if choice.tried[-1].substeps > choice.substeps:
+    """What to do where no number of substeps is enough; empty where it is."""
+    if choice.reason == "kink":
         return (
-            f"more than {choice.substeps} substeps do little good. The equations may have a kink or a jump (friction, a"
+            f"More than {choice.substeps} substeps do little good. The equations may have a kink or a jump (friction, a"
             " wall, a relay): smooth it over some hundredths of what is usual there."
         )
-    return (
-        f"{choice.substeps} substeps, the most there are, are too few. Take a shorter dt, or replace the fastest states"
-        " by their steady state."
-    )
+    if choice.reason == "fast":
+        return (
+            "As many substeps as can be solved with are too few. Take a shorter dt, or replace the fastest states by"
+            " their steady state."
+        )
+    return ""

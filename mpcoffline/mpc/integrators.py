@@ -117,13 +117,6 @@ def _affine_parts(ode: ca.Function, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
     return A, ca.horzcat(B, ca.sparsify(ode(ca.DM.zeros(x.shape), ca.DM.zeros(u.shape), theta)))
 
 
-def is_affine(ode: ca.Function) -> bool:
-    """Whether f is affine in (x, u) for every theta."""
-    symbols = [ca.SX.sym(f"i{i}", *ode.size_in(i)) for i in range(3)]
-    z = ca.vertcat(*symbols[:2])
-    return not ca.depends_on(ca.jacobian(ode(*symbols), z), z)
-
-
 def exact_scheme(ode: ca.Function, dt: float, theta: Array, given: Scheme | None = None) -> Scheme:
     """The exponential whose series is exact up to rounding at theta and around it.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -13,21 +12,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.places import warn_once
 from mpcoffline.core.types import Array
 
 from .component import Component, blocks_from_json
-from .expressions import function_from_json, function_to_json, traced
+from .expressions import function_from_json, function_to_json, is_affine, traced
 from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfall
-from .integrators import Scheme, exact_scheme, integrated, is_affine, is_short
+from .integrators import Scheme, exact_scheme, integrated, is_short
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
 from .signals import Signal
-from .substeps import Flow, choice_from, choice_on
+from .substeps import Choice, Flow, choice_from, choice_on
 from .torch_import import TorchExpression
 
 Dynamics = Callable[..., ca.SX]  # (x, u, p) or, with signals, (x, u, p, d)
-
-logger = logging.getLogger(__name__)
 
 
 class Model(Component):
@@ -116,6 +114,8 @@ class Model(Component):
         discrete: bool = True,
         residual: bool = False,
         learn_weights: bool = False,
+        integrator: str = "auto",
+        delay: int | Sequence[int] | None = None,
     ) -> Model:
         """A model from a ``torch.nn.Module`` that was trained elsewhere.
 
@@ -139,6 +139,8 @@ class Model(Component):
             residual: Whether it gives the change of the state in a step, ``x+ = x + module(x, u)``.
             learn_weights: Whether its weights are parameters that learning may change, named as in the module with
                 underscores (``0_weight``); by default they are fixed numbers, with which C computes much faster.
+            integrator: As in the class, for ``discrete=False``.
+            delay: As in the class.
 
         Raises:
             InvalidArgumentError: For what cannot be traced, a layer that is not known (it is named), or sizes that do
@@ -155,7 +157,9 @@ class Model(Component):
                 ) from error
             return x + out if residual else out
 
-        return cls(dynamics, nx, nu, dt, network.weights if learn_weights else None, discrete=discrete or residual)
+        parameters = network.weights if learn_weights else None
+        is_map = discrete or residual
+        return cls(dynamics, nx, nu, dt, parameters, discrete=is_map, integrator=integrator, delay=delay)
 
     def _take(self, function: ca.Function, integrator: str, scheme: Scheme | None, *, settled: bool = True) -> None:
         """Takes an ODE with its scheme, or without one a map as it is."""
@@ -196,6 +200,17 @@ class Model(Component):
         """The same model with the inputs of the step before in its state, as prices on changes need them."""
         other = copy.copy(self)
         other._lay_out(self.layout.with_previous(), self.plant)
+        return other
+
+    def plus(self, addition: ca.Function) -> Self:
+        """The same model with something added to the plant's map, which is a discrete one then.
+
+        Args:
+            addition: A CasADi function ``(x, u) -> (n_states, 1)`` of the plant's states and the inputs that act.
+        """
+        x, u, theta = (ca.SX.sym(name, *self.plant.size_in(i)) for i, name in enumerate("xup"))
+        other = copy.copy(self)
+        other._take(ca.Function("dynamics", [x, u, theta], [self.plant(x, u, theta) + addition(x, u)]), "map", None)
         return other
 
     def _first_scheme(self, ode: ca.Function, asked: Scheme | None) -> Scheme:
@@ -267,8 +282,6 @@ class Model(Component):
     def suited_to(self, start: Array, inputs: Array) -> Model:
         """The model with the substeps that ``integrator="auto"`` takes before there is a log; itself once it has some.
 
-        Warns where no number of substeps is enough.
-
         Args:
             start: A state that matters, as the reference, ``(n_states,)``.
             inputs: Inputs that may be applied, with usual signals beside them, ``(m, nu + n_signals)``.
@@ -277,9 +290,7 @@ class Model(Component):
             return self
         flow = Flow(self.ode, self.dt, self.space.theta)
         choice = choice_from(flow, start, inputs)
-        if not choice.enough:
-            logger.warning("A step of %g s of the model is not accurate: %s", self.dt, shortfall(choice))
-        return self.with_scheme(Scheme("rk4", choice.substeps))
+        return self._with_substeps(choice, "with the inputs that may be applied")
 
     def suited_to_log(self, table: Rows, *, finer: bool = False) -> Model:
         """The model with the substeps that ``integrator="auto"`` takes on a log; itself where another was asked for.
@@ -294,6 +305,12 @@ class Model(Component):
             return self.with_scheme(exact_scheme(self.ode, self.dt, self.space.theta, self.scheme))
         flow = Flow(self.ode, self.dt, self.space.theta)
         choice = choice_on(flow, *sampled(table, self.layout), self.scheme.substeps if finer else 1)
+        return self._with_substeps(choice, "on this log")
+
+    def _with_substeps(self, choice: Choice, where: str) -> Model:
+        """The model with what was chosen; warns, once, where that is not enough."""
+        if advice := shortfall(choice):
+            warn_once(f"A step of {self.dt:g} s of the model {self!r} is not accurate {where}: {advice}")
         return self.with_scheme(Scheme("rk4", choice.substeps))
 
     def check(self, table: Rows) -> IntegrationCheck:

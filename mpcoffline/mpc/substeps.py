@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 
 from .integrators import MOST_SUBSTEPS, rk4_expression
+from .scaling import increments_scale
 
 _TYPICAL, _WORST = 0.02, 0.2  # errors of a step that may be, in increments
 _QUANTILE = 0.99
@@ -51,16 +53,12 @@ class Choice:
 
     Attributes:
         substeps: The number to take.
-        tried: What was tried, in this order.
+        reason: ``"enough"``: the errors are small with it; ``"kink"``: they fall as slowly with more substeps as those
+            of an ODE that is not smooth; ``"fast"``: as many as there may be are too few.
     """
 
     substeps: int
-    tried: tuple[Doubling, ...] = ()
-
-    @property
-    def enough(self) -> bool:
-        """Whether the errors are small with it."""
-        return not self.tried or (self.tried[-1].substeps == self.substeps and self.tried[-1].excess <= 1.0)
+    reason: Literal["enough", "kink", "fast"] = "enough"
 
 
 class Flow:
@@ -133,7 +131,7 @@ def choice_on(flow: Flow, x: Array, u: Array, reached: Array, least: int = 1) ->
     if not known.any():
         return Choice(least)
     x, u, reached = x[known], u[known], reached[known]
-    spread, coarse = (reached - x).std(axis=0), {least: flow(x, u, least)}
+    spread, coarse = increments_scale(x, reached), {least: flow(x, u, least)}
 
     def compared(n: int) -> Doubling:
         coarse[2 * n] = flow(x, u, 2 * n)
@@ -157,7 +155,11 @@ def choice_from(flow: Flow, start: Array, inputs: Array) -> Choice:
         start: A state that matters, as the reference, ``(nx,)``.
         inputs: Inputs that may be applied, ``(m, nu)``.
     """
-    z = np.concatenate([flow.modes(start, u) for u in inputs])
+    modes, least = np.concatenate([flow.modes(start, u) for u in inputs]), 1
+    while not _followed(modes, least):
+        least *= 2
+        if least > flow.most:
+            return Choice(1, "fast")
     drawn = np.random.default_rng(0).uniform(size=(_STEPS, _SEQUENCES, inputs.shape[1]))
     low, high = inputs.min(axis=0), inputs.max(axis=0)
     held = np.broadcast_to(inputs, (_STEPS, *inputs.shape))
@@ -165,13 +167,18 @@ def choice_from(flow: Flow, start: Array, inputs: Array) -> Choice:
 
     def compared(n: int) -> Doubling:
         error = _quantile(_errors_along(flow, start, sequences, n), _FREE_QUANTILE)
-        with np.errstate(over="ignore", invalid="ignore"):
-            exact, found = np.exp(z), _stability(z / n) ** n
-            mode = np.abs(found - exact) / np.maximum(1.0, np.abs(exact))
-        largest = float(np.nan_to_num(mode, nan=np.inf).max(initial=0.0))
-        return Doubling(n, max(error, largest * _TYPICAL / _MODE), error)
+        return Doubling(n, error, error)
 
-    return _doubled(compared, 1, flow.most)
+    return _doubled(compared, least, flow.most)
+
+
+def _followed(modes: NDArray[np.complex128], n: int) -> bool:
+    """Whether n substeps follow the modes of a linear ODE; see :func:`choice_from`."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        z, exact = modes / n, np.exp(modes)
+        found = (1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))) ** n
+        missed = np.abs(found - exact) / np.maximum(1.0, np.abs(exact))
+    return bool((missed <= _MODE).all())
 
 
 def _errors_along(flow: Flow, start: Array, sequences: Array, n: int) -> Array:
@@ -184,8 +191,10 @@ def _errors_along(flow: Flow, start: Array, sequences: Array, n: int) -> Array:
         x = fine
     x, coarse, fine = np.concatenate(rows, axis=1)
     increments = fine - x
-    spread = increments[np.isfinite(increments).all(axis=1)].std(axis=0) if len(x) else 0.0
-    return relative(coarse - fine, np.nan_to_num(spread) + np.abs(increments))
+    finite = increments[np.isfinite(increments).all(axis=1)]
+    with np.errstate(over="ignore"):
+        spread = finite.std(axis=0) if len(finite) else 0.0
+        return relative(coarse - fine, spread + np.abs(increments))
 
 
 def _doubled(compared: Callable[[int], Doubling], least: int, most: int) -> Choice:
@@ -194,29 +203,27 @@ def _doubled(compared: Callable[[int], Doubling], least: int, most: int) -> Choi
     The error may grow at first, where RK4 is unstable. Where none is small, the fewest substeps with an error near the
     smallest are taken.
     """
-    tried = [compared(least)]
+    tried: list[Doubling] = [compared(least)]
+    reason: Literal["fast", "kink"] = "fast"
     while tried[-1].excess > 1.0 and 2 * tried[-1].substeps <= most:
         tried.append(compared(2 * tried[-1].substeps))
         falls = [a.excess / b.excess for a, b in itertools.pairwise(tried[-3:]) if np.isfinite(a.excess)]
-        if len(falls) == 2 and 1.0 <= min(falls) <= max(falls) < _POOR:
+        if len(falls) == 2 and 1.0 <= min(falls) <= max(falls) < _POOR and tried[-1].excess > 1.0:
+            reason = "kink"
             break
     smallest = min(one.excess for one in tried)
-    near = (one.substeps for one in tried if one.excess <= max(_NEAR * smallest, 1.0))
-    return Choice(least if np.isinf(smallest) else next(near), tuple(tried))
+    if smallest <= 1.0:
+        return Choice(tried[-1].substeps)
+    return Choice(next(one.substeps for one in tried if one.excess <= _NEAR * smallest), reason)
 
 
 def relative(errors: Array, size: Array) -> Array:
     """The largest of a row's errors relative to their size, ``(B,)``; infinite where they are not finite."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        relative = np.where(errors == 0.0, 0.0, np.abs(errors) / size)
-    return np.asarray(np.nan_to_num(relative, nan=np.inf).max(axis=1, initial=0.0))
+        found = np.where(errors == 0.0, 0.0, np.abs(errors) / size)
+    return np.asarray(np.where(np.isnan(found), np.inf, found).max(axis=1, initial=0.0))
 
 
 def _quantile(errors: Array, q: float) -> float:
     """A quantile that is one of the errors, so that infinite ones do no harm; 0 of none."""
     return float(np.quantile(errors, q, method="higher")) if len(errors) else 0.0
-
-
-def _stability(z: Array) -> Array:
-    """What RK4 makes of e^z."""
-    return np.asarray(1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0))))

@@ -18,6 +18,8 @@ from torch import Tensor
 from mpcoffline.core.errors import InvalidArgumentError
 
 from .expressions import expanded, instructions
+from .layer_steps import Dense, Map
+from .layers import Layered, layered
 
 _Scalar = Tensor | float
 _Mask = Tensor | bool
@@ -80,6 +82,9 @@ _BINARY: dict[int, Callable[[Tensor, Tensor], Tensor]] = _ARITHMETIC | {
 }
 
 
+_LARGE = 2000  # instructions, from which on layers are looked for
+
+
 class TorchTwin:
     """A CasADi function evaluated by torch, batched and differentiable in every input.
 
@@ -113,6 +118,9 @@ class TorchTwin:
             latest[targets[0]] = len(self._program)
             self._program.append((op, places, constant))
         self._branches = any(op == ca.OP_IF_ELSE_ZERO for op, *_ in self._program)
+        self._layers: Layered | None = None
+        if len(self._program) > _LARGE and not self._branches:
+            self._layers = layered(function)
 
     def __call__(self, *inputs: Tensor) -> Tensor:
         """Evaluates the function.
@@ -137,6 +145,8 @@ class TorchTwin:
                     actual=f"shape {tuple(tensor.shape)}",
                 )
         columns = [tensor.unbind(-1) for tensor in inputs]
+        if self._layers is not None:
+            return _in_layers(self._layers, columns, inputs[0])
         needed: list[_Mask] | None = None
         if self._branches and torch.is_grad_enabled():
             with torch.no_grad():
@@ -180,6 +190,50 @@ class TorchTwin:
                     mask = mask & (work[places[0]] != 0)
                 needed[place] = True if needed[place] is True or mask is True else needed[place] | mask
         return needed
+
+
+def _in_layers(structure: Layered, columns: Sequence[Sequence[Tensor]], like: Tensor) -> Tensor:
+    """The outputs ``(..., m)`` of a function with layers: products of matrices, and maps of whole rows."""
+    work: dict[int, _Scalar] = {}
+    rows: dict[tuple[int, ...], Tensor] = {}  # by the numbers of their elements: results of layers
+
+    def row(numbers: Sequence[int]) -> Tensor:
+        known = rows.get(tuple(numbers))
+        if known is None:
+            elements = [_tensor(work[k], like) for k in numbers]
+            shape = np.broadcast_shapes(*(tuple(element.shape) for element in elements))
+            known = torch.stack([element.expand(shape) for element in elements], dim=-1)
+        return known
+
+    def keep(numbers: Sequence[int], result: Tensor) -> None:
+        rows[tuple(numbers)] = result
+        work.update(zip(numbers, result.unbind(-1), strict=True))
+
+    for step in structure.steps:
+        if isinstance(step, Dense):
+            matrix, bias = (
+                torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (step.matrix, step.bias)
+            )
+            keep(step.targets, row(step.sources) @ matrix.T + bias)
+        elif isinstance(step, Map):
+            source, results = row(step.sources), list[_Scalar]()
+            constants = [torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in step.constants]
+            for op, operands in step.program:
+                values = [source if o == -1 else constants[-2 - o] if o < 0 else results[o] for o in operands]
+                results.append(_applied(op, values, like))
+            for place, targets in zip(step.results, step.targets, strict=True):
+                keep(targets, _tensor(results[place], like))
+        else:
+            for k in step.nodes:
+                node = structure.nodes[k]
+                if node.op == ca.OP_CONST:
+                    work[k] = node.constant
+                elif node.op == ca.OP_INPUT:
+                    work[k] = columns[node.operands[0]][node.operands[1]]
+                else:
+                    work[k] = _applied(node.op, [work[o] for o in node.operands], like)
+    shape = np.broadcast_shapes(*(tuple(given[0].shape) for given in columns if given))
+    return torch.stack([_tensor(work[k], like).expand(shape) for k in structure.outputs], dim=-1)
 
 
 def _cut(operand: _Scalar, needed: _Mask) -> _Scalar:

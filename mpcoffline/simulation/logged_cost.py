@@ -8,6 +8,8 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import gathered
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
+from mpcoffline.learning.known_cost import excerpt, known_cost
+from mpcoffline.mpc import MPC
 
 _ROWS = 20_000
 _N_FEATURES = 400
@@ -18,22 +20,36 @@ _HELD_OUT = 0.2
 class LoggedCost:
     """L(s, a) by regression of the logged costs.
 
-    A full quadratic in (s, a) where that is exact. Otherwise the quadratic with random features (hyperbolic tangents,
-    which stay bounded outside the data, so that there the quadratic decides), by ridge regression; a part of the
-    episodes is held out to measure how good it is. Never below the cheapest logged cost.
+    The MPC's stage cost, where that is what was logged (:func:`~mpcoffline.learning.known_cost`); a full quadratic in
+    (s, a) where that is exact. Otherwise the quadratic with random features (hyperbolic tangents, which stay bounded
+    outside the data, so that there the quadratic decides), by ridge regression, and never below the cheapest logged
+    cost, as beyond the data it is a guess. A part of the episodes is held out to measure how good it is.
 
     Args:
         table: The transitions; smoothed, where s is noisy.
         seed: Seeds features and split.
         seen: How many coordinates of s the cost may depend on, the first ones; all by default.
+        mpc: Its stage cost may be the logged one.
+        logged: The transitions as they were logged, where ``table`` is smoothed.
 
     Attributes:
         r2: Share of the variance of held-out costs that it explains.
         low: The cheapest logged cost.
-        exact: Whether a quadratic is exact.
+        exact: Whether the MPC's stage cost or a quadratic is exact.
     """
 
-    def __init__(self, table: TransitionTable, seed: int = 0, seen: int | None = None) -> None:
+    def __init__(
+        self,
+        table: TransitionTable,
+        seed: int = 0,
+        seen: int | None = None,
+        *,
+        mpc: MPC | None = None,
+        logged: TransitionTable | None = None,
+    ) -> None:
+        known = None if mpc is None else known_cost(mpc, excerpt(table if logged is None else logged, seed))
+        self._known = None if known is None or known.constant or known.agreeing < 1.0 else known
+        self._mpc = mpc
         rng = np.random.default_rng(seed)
         self._seen = table.ny if seen is None else seen
         table = table if self._seen == table.ny else gathered(table, range(self._seen))
@@ -42,11 +58,11 @@ class LoggedCost:
         self._level = float(cost.mean())  # a large constant, which ridges would shrink
         self._features = RandomFeatures(x, 0, rng)
         self._fit(x, cost)
-        self.exact = self._r2(x_test, cost_test) > _EXACT
+        self.exact = self._known is not None or self._r2(x_test, cost_test) > _EXACT
         if not self.exact:
             self._features = RandomFeatures(x, _N_FEATURES, rng)
             self._fit(x, cost)
-        self.r2 = self._r2(x_test, cost_test)
+        self.r2 = self._r2(x_test, cost_test) if self._known is None else 1.0 - self._known.missed
         self.low = float(min(cost.min(), cost_test.min()))
 
     def _fit(self, x: Array, cost: Array) -> None:
@@ -59,8 +75,11 @@ class LoggedCost:
 
     def __call__(self, s: Array, a: Array) -> Array:
         """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``."""
+        if self._known is not None and self._mpc is not None:
+            ours = self._mpc.stage_function(s.T, a.T, self._mpc.theta).full().ravel()
+            return np.asarray(self._known.scale * ours + self._known.offset)
         cost = self._regression(self._features(np.hstack([s[:, : self._seen], a])))[:, 0] + self._level
-        return np.maximum(cost, self.low)
+        return np.asarray(cost if self.exact else np.maximum(cost, self.low))
 
 
 def _rows_split(table: TransitionTable, rng: np.random.Generator) -> tuple[TransitionTable, TransitionTable]:

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from mpcoffline.core.types import Array
-from mpcoffline.mpc import MPC, StageCost, TerminalCost
+from mpcoffline.mpc import MPC, StageCost, TerminalCost, expressions
 
 _TOUCHING = 1e-9  # distance from a bound that counts as none, relative to 1 + |u|
 _SINGULAR = 1e-13  # of a Hessian's diagonal, below which a pivot counts as zero
@@ -37,9 +37,7 @@ def misfit(mpc: MPC) -> str:
 
 def is_affine(mpc: MPC) -> bool:
     """Whether f_theta is affine in (x, u) for every theta."""
-    x, u, theta = _symbols(mpc)
-    z = ca.vertcat(x, u)
-    return not ca.depends_on(ca.jacobian(mpc.dynamics_function(x, u, theta), z), z)
+    return expressions.is_affine(mpc.dynamics_function)
 
 
 def promises_convexity(cost: StageCost | TerminalCost) -> bool:

@@ -36,6 +36,29 @@ def mpc_of(case: str) -> MPC:
             delay=[2, 0],
         )
         return MPC(model, cost, QuadraticCost(np.eye(2)), 12, 0.95, [-1.0, -1.0], [1.0, 1.0])
+    if case == "stiff motor":  # exact
+        model = Model(
+            lambda x, u, p: ca.vertcat(100.0 * (x[1] - x[0]), (u[0] - p["R"] * x[1] - 0.05 * x[0]) / p["L"]),
+            2,
+            1,
+            0.02,
+            {"R": 1.0, "L": 1e-3},
+        )
+        return MPC(
+            model, QuadraticCost(np.eye(2), [[0.1]], [[0.0], [0.02]]), QuadraticCost(np.eye(2)), 12, 0.95, [-3], [3]
+        )
+    if case == "substeps":  # so many that its code comes in pieces
+        model = Model(
+            lambda x, u, p: ca.vertcat(x[1], 9.81 - x[2] ** 2 / x[0] ** 2, (u[0] - 2.0 * x[2]) / p["L"]),
+            3,
+            1,
+            0.05,
+            {"L": 0.02},
+            integrator="rk4:16",
+        )
+        reference = [1.0, 0.0, np.sqrt(9.81)]
+        cost = QuadraticCost(np.eye(3), [[0.1]], x_ref=reference, u_ref=[2.0 * reference[2]])
+        return MPC(model, cost, QuadraticCost(np.eye(3), x_ref=reference), 12, 0.95, [0.0], [12.0])
     if case == "three inputs":
         return random_linear(0, nu=3)
     if case == "network":
@@ -53,7 +76,19 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
     return folder / "program"
 
 
-@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "three inputs", "network", "late inputs"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        LINEAR,
+        PENDULUM,
+        CARTPOLE,
+        "three inputs",
+        "network",
+        "late inputs",
+        "stiff motor",
+        pytest.param("substeps", marks=pytest.mark.slow),
+    ],
+)
 def test_the_c_code_replays_its_vectors(case: str, tmp_path: Path) -> None:
     files = export_c(MPCPolicy(mpc_of(case)), tmp_path)
     assert {file.name for file in files} >= {"mpc_controller.c", "mpc_controller.h", "CMakeLists.txt"}

@@ -81,7 +81,7 @@ def closed_loops(policy: MPCPolicy, starts: Array, n_steps: int) -> list[tuple[b
 def test_failures_are_answered_as_in_python(
     mpc: MPC, options: dict[str, Any], starts: list[list[float]], tmp_path: Path
 ) -> None:
-    policy = MPCPolicy(mpc, "ddp", n_starts=4, **options)
+    policy = MPCPolicy(mpc, "ddp", n_starts=4, round_corners=False, **options)
     steps = closed_loops(policy, np.array(starts), 25)
     expected = in_python(policy, steps)
     assert (expected[:, 0] == 1).any()

@@ -56,7 +56,21 @@ def test_a_quadratic_cost_is_found_exactly() -> None:
     x, u = np.array([[3.0, -2.0]]), np.array([[1.5]])  # far outside the data
     expected = lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)
     np.testing.assert_allclose(cost(x, u), expected, rtol=1e-3)
-    assert cost(np.zeros((1, 2)), np.zeros((1, 1))) >= cost.low == LOG.costs.min()
+    assert cost(np.zeros((1, 2)), np.zeros((1, 1))) == pytest.approx(0.0, abs=1e-4)  # cheaper than anything logged
+    assert cost.low == LOG.costs.min() > 0.0
+
+
+def test_the_cost_of_the_mpc_is_used_where_it_is_the_logged_one() -> None:
+    """Of any sign, beyond all data, and where the states are noisy."""
+    s, a = (v.astype(np.float64) for v in (LOG.observations, LOG.actions))
+    noisy = s + 0.02 * np.random.default_rng(0).normal(size=s.shape)
+    costs = 2.0 * LOG.costs - 5e3
+    table = TransitionTable.from_arrays(noisy, a, costs, LOG.next_observations, LOG.terminations, LOG.episode_ids)
+    cost = LoggedCost(table, mpc=lq_plant.make_mpc())
+    assert cost.exact
+    x, u = np.array([[3.0, -2.0], [0.0, 0.0]]), np.array([[1.5], [0.0]])
+    expected = 2.0 * (lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)) - 5e3
+    np.testing.assert_allclose(cost(x, u), expected, atol=0.1)
 
 
 def test_another_cost_is_learned_with_random_features() -> None:

@@ -104,4 +104,4 @@ def test_ratios_are_of_costs_above_the_cheapest() -> None:
     assert (c.n_starts, c.n_steps) == (4, 5)
     below = Comparison.of(simulation(10.0, 20.0), simulation(-5.0, 30.0), 1.0)  # cheaper than anything logged
     assert all(r >= 0.0 for r in below.ratios)
-    assert below.ratios[1] == pytest.approx(35.0 / 25.0)
+    assert below.ratios == pytest.approx((3.5 / 18.5, 38.5 / 28.5))  # from a tenth of -5 ... 30 below -5

@@ -157,7 +157,7 @@ def test_one_step_least_squares_is_biased_and_the_filter_is_not() -> None:
 
 
 def test_clean_data_are_left_alone() -> None:
-    for table in (CLEAN, with_measurement_noise(CLEAN, 0.005, 0)):
+    for table in (CLEAN, with_measurement_noise(CLEAN, 0.002, 0)):
         result = identify(GUESS, table)
         assert result.table is table
         np.testing.assert_array_equal(result.theta, identify_one_step(GUESS, table).theta)

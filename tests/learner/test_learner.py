@@ -228,7 +228,7 @@ def test_a_value_function_of_another_discount_is_refused() -> None:
     assert value.discount == lq_plant.DISCOUNT
     message = r"value_function: expected .* of this fit, 0\.95, got one of 0\.9\."
     with pytest.raises(InvalidArgumentError, match=message):
-        quick(preset="default", value_function=value).fit(table, show_progress=False)
+        quick(preset="default", discount=0.95, value_function=value).fit(table, show_progress=False)
     quick(value_function=value, learn="cost").fit(table, show_progress=False)
 
 

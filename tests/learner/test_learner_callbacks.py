@@ -26,6 +26,7 @@ QUICK: dict[str, Any] = {
     "trim": 1.0,
     "adapt_above": 0.0,
     "terminal": "quadratic",
+    "stage_cost": "fitted",  # else it is known here
 }
 EPOCHS = 6  # three of (VALUE), two of (FIT), and the last one
 

@@ -85,18 +85,16 @@ def learned(units: Units, mpc: MPC, table: TransitionTable, preset: str, **optio
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["paper", "default"])
 @pytest.mark.parametrize("name", ["spring", *TASKS])
-def test_powers_of_two_change_no_bit(name: str, preset: str) -> None:
+def test_powers_of_two_change_no_bit(name: str) -> None:
     """Rounding does not depend on them: theta, V and the terminal cost from it are the same numbers."""
     mpc, table = problem(name)
     units = Units(powers(mpc.nx, 0), powers(mpc.nu, 1), cost=4.0**-7)
-    before, after = learned(Units(), mpc, table, preset), learned(units, mpc, table, preset)
+    before, after = (learned(u, mpc, table, "default") for u in (Units(), units))
     differences = before.differences(after)
     terminal = differences.pop("terminal")
     assert differences == dict.fromkeys(differences, 0.0)
-    if preset == "default":  # the tasks' own one is a norm, whose unit nobody can change
-        assert terminal == 0.0 or (name == "linear" and terminal < 1e-9)  # the Riccati equation's solver balances
+    assert terminal == 0.0 or (name == "linear" and terminal < 1e-9)  # the Riccati equation's solver balances
 
 
 @pytest.mark.parametrize("units", [Units(cost=4.0**9), Units([2.0**-15, 2.0**9], 2.0**12)], ids=["cost", "states"])
@@ -143,7 +141,7 @@ def test_a_parameter_that_starts_at_zero_is_found(start: Any) -> None:
 
 def closed_loop(units: Units, mpc: MPC, table: TransitionTable) -> float:
     """The true cost of the spring's mass under what is learned in other units, in the old ones."""
-    schedule = {"value_n_steps": 500, "hidden": (32,), "value_batch_size": 128, "horizon": 15}
+    schedule = {"value_n_steps": 300, "hidden": (32,), "value_batch_size": 128, "horizon": 15}
     learner = OfflineMPCLearner(units.mpc(mpc), seed=0, **schedule)
     learner.fit(units.table(table), show_progress=False)
     x, total, plan = np.random.default_rng(1).uniform([-2.0, -1.0], [2.0, 1.0], (20, 2)), 0.0, None
@@ -161,11 +159,9 @@ def test_the_closed_loop_is_the_same_in_any_units() -> None:
     mpc, table = spring_mpc(), spring_log()
     spread = float(table.costs.std())
     others = [
-        Units(cost=1e-6),
         Units(cost=1e6),
         Units(offset=1e6 * spread),
         Units(offset=-1e6 * spread),
-        Units([1e6, 1e-6], 1e-6),
         Units([1e-6, 1e6], 1e6, cost=1e-6, offset=-1e3 * spread),
     ]
     costs = [closed_loop(units, mpc, table) for units in (Units(), *others)]

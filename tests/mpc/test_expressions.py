@@ -12,7 +12,7 @@ import pytest
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.envs import ENV_IDS
-from mpcoffline.mpc.expressions import _BINARY, _UNARY, function_from_json, function_to_json, traced
+from mpcoffline.mpc.expressions import _BINARY, _UNARY, function_from_json, function_to_json, is_affine, traced
 from mpcoffline.plants.nominal import nominal_mpc
 
 
@@ -139,3 +139,19 @@ def test_lost_expressions_are_refused() -> None:
     x = ca.SX.sym("x")
     with pytest.raises(InvalidArgumentError, match=r"dynamics.*constant NaN.*math\.sin"):
         traced("dynamics", ca.Function("f", [x], [x + ca.SX(float("nan"))]))
+
+
+@pytest.mark.parametrize(
+    ("expression", "affine"),
+    [
+        (lambda x, u, p: p[0] ** 2 * x[0] - u[0] * ca.sin(p[1]) + ca.sign(p[0]), True),
+        (lambda x, u, p: x[0] * u[0], False),
+        (lambda x, u, p: x[0] + ca.sign(x[1]), False),
+        (lambda x, u, p: x[0] + ca.floor(u[0]), False),
+        (lambda x, u, p: ca.if_else(x[0] > 1.0, x[0], x[0] + 1.0), False),
+        (lambda x, u, p: ca.if_else(p[0] > 1.0, x[0], u[0]), True),
+    ],
+)
+def test_steps_are_not_affine(expression: Any, affine: bool) -> None:
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p", 2)
+    assert is_affine(ca.Function("f", [x, u, p], [expression(x, u, p)])) is affine

@@ -158,7 +158,7 @@ def test_a_bound_that_can_not_be_kept_at_the_start_does_not_stop_control(unit: f
 def test_kinks_cost_no_more_than_applying_whatever_is_found() -> None:
     policy = MPCPolicy(kinked())
     cost = closed_loop(policy, [3.0, -2.0])
-    assert answers(policy.solver_stats)["best_plan"] > 5
+    assert not answers(policy.solver_stats)  # all are solved, with the corners rounded
     assert cost <= 1.001 * always_applied(policy, [3.0, -2.0])
 
 
@@ -171,7 +171,7 @@ def test_a_kink_on_the_input_bound_costs_little() -> None:
 def test_what_ddp_returns_unaccepted_is_the_model_run_within_the_bounds() -> None:
     mpc = kinked()
     x = np.random.default_rng(0).normal(size=(60, 2)) * 2.0
-    solution = make_solver(mpc, "ddp").solve(x)
+    solution = make_solver(mpc, "ddp", max_iterations=1).solve(x)
     failed = ~solution.success
     assert failed.any()
     assert np.isfinite(solution.value).all()

@@ -168,12 +168,15 @@ def check_bounds(
     high: ArrayLike | None,
 ) -> None:
     """Refuses the first action beyond the MPC's bounds by more than rounding; None is no bound."""
+    bounds = [np.abs(np.asarray(bound, dtype=np.float64)) for bound in (low, high) if bound is not None]
+    finite = [np.where(np.isfinite(bound), bound, 0.0) for bound in bounds]
+    size = np.max(np.broadcast_arrays(*finite, np.zeros(actions.shape[1:])), axis=0)  # of each input, in its own unit
     for bound, sign, word in ((low, -1.0, "above"), (high, 1.0, "below")):
         if bound is None:
             continue
         limit = np.broadcast_to(np.asarray(bound, dtype=np.float64), actions.shape[1:])
         excess = sign * (actions.astype(np.float64) - limit)
-        outside = excess > 1e-6 * np.maximum(1.0, np.abs(limit))
+        outside = excess > 1e-6 * size
         if outside.any():
             row, column = (int(i) for i in np.argwhere(outside)[0])
             raise InvalidDataError(

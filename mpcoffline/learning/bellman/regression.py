@@ -103,8 +103,6 @@ class ParameterTraining:
         self._groups = groups = groups if cost is None else tuple(group for group in groups if group != "cost")
         self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
         costs = table.costs
-        if len(costs) > 1 and np.ptp(costs) == 0.0 and cost is None:
-            _log.warning("%s: all costs are %g, so they do not tell what is good", table.name, costs[0])
         self._rng = np.random.default_rng(seed)
         self._problem = BellmanProblem(mpc, value, cost_spread(costs), cost)
         self._sample = table.columns(torch.from_numpy(table.sample(config.refit_rows, self._rng).rows))

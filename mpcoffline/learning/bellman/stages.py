@@ -12,7 +12,7 @@ import torch
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import identify
+from mpcoffline.estimation import fit_residual, identify, with_residual
 from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.ends import ends_matter, priced_ends
@@ -47,11 +47,14 @@ class StartConfig:
             errors): where its structure is not the plant's. Else the model stays and the cost alone is fitted.
         delays: With ``init="identified"``, whether dead time is looked for in the data before all else, where the model
             says nothing of it (``delay=None``), and checked where it does.
+        residual: With ``init="identified"``, whether a model that misses more than that gets a learned residual, if
+            held-out episodes ask for one (:func:`mpcoffline.estimation.fit_residual`); it stays then, too.
     """
 
     init: Init = "nominal"
     adapt_above: float = 0.0
     delays: bool = True
+    residual: bool = False
 
     def __post_init__(self) -> None:
         check_known("init", self.init, get_args(Init))
@@ -80,8 +83,18 @@ def identified(known: Known, config: StartConfig) -> Known:
     found = identify(known.mpc, known.table, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
-    mpc = known.mpc.replace(model=found.model)
-    return replace(known, mpc=mpc, table=found.table, model_error=found.error_after)
+    known = replace(known, mpc=known.mpc.replace(model=found.model), table=found.table, model_error=found.error_after)
+    return completed(known) if config.residual and found.error_after > config.adapt_above else known
+
+
+def completed(known: Known) -> Known:
+    """The identified model with a learned residual, where held-out episodes ask for one."""
+    residual = fit_residual(known.mpc, known.table, known.seed)
+    _log.info("%s", residual)
+    if not residual.taken:
+        return known
+    mpc = with_residual(known.mpc, residual)
+    return replace(known, mpc=mpc, model_error=residual.one_step[1], residual_share=residual.share)
 
 
 class LearnValue(Stage):
@@ -129,7 +142,7 @@ class LearnParameters(Stage):
 
     def _adapting(self, known: Known) -> ParameterConfig:
         """The configuration, without steps on a model that was identified and predicts well, or has the right cost."""
-        config, missed = self._config, known.model_error
+        config, missed = self._config, 0.0 if known.residual_share else known.model_error
         if known.cost is not None and (known.cost.constant or missed is not None):
             return replace(config, n_steps=0)
         if missed is None or not config.n_steps:
@@ -147,7 +160,8 @@ class LearnParameters(Stage):
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds theta and the result."""
-        return replace(known, mpc=known.mpc.with_theta(training.result.theta), result=training.result)
+        result = replace(training.result, residual_share=known.residual_share)
+        return replace(known, mpc=known.mpc.with_theta(result.theta), result=result)
 
 
 @dataclass(frozen=True)

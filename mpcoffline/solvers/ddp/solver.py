@@ -97,6 +97,7 @@ class DDPSolver(Solver):
             below which a problem is solved; 1000 times as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
         n_threads: Threads that share a batch; a batch of up to eight problems uses one.
+        round_corners: Whether to round corners for what is not solved; exported C never does.
 
     Raises:
         InvalidArgumentError: For an MPC with constraints, or functions without a counterpart in C.
@@ -115,9 +116,15 @@ class DDPSolver(Solver):
         tolerance: float = 1e-11,
         n_starts: int | None = None,
         n_threads: int = 1,
+        round_corners: bool = True,
     ) -> None:
         super().__init__(
-            mpc, max_iterations=max_iterations, tolerance=tolerance, n_starts=n_starts, n_threads=n_threads
+            mpc,
+            max_iterations=max_iterations,
+            tolerance=tolerance,
+            n_starts=n_starts,
+            n_threads=n_threads,
+            round_corners=round_corners,
         )
         check_options({"max_iterations": max_iterations, "tolerance": tolerance, "n_threads": n_threads})
         if n_starts is None:
@@ -148,6 +155,7 @@ class DDPSolver(Solver):
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
         self._rounding: Rounding | None = None
+        self._round_corners = bool(round_corners)
 
     @classmethod
     def refuses(cls, mpc: MPC) -> str:
@@ -157,7 +165,7 @@ class DDPSolver(Solver):
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
         result = self.run(x, theta, u0, warm_start)
-        if np.count_nonzero(result["status"]):
+        if self._round_corners and np.count_nonzero(result["status"]):
             self._rounded().improve(self, x, theta, u0, result)
         status = result["status"]
         stats: Stats = {

@@ -214,6 +214,18 @@ def test_check_fits_names_what_differs() -> None:
         table.check_fits(3, 2, [-2, -2], [0.01, 2])
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_bounds_are_in_the_unit_of_the_input(unit: float) -> None:
+    s, u = np.zeros((3, 1)), unit * np.array([[-1e-8], [0.5], [1.0]])  # -1e-8 is rounding of a range of 1
+    table = TransitionTable.from_arrays(s, u, np.zeros(3), s, np.zeros(3))
+    table.check_fits(1, 1, [0.0], [unit])
+    table.check_fits(1, 1, [-np.inf], [np.inf])
+    with pytest.raises(InvalidDataError, match="action 0"):
+        table.check_fits(1, 1, [0.0], [0.99 * unit])
+    with pytest.raises(InvalidDataError, match="action 0"):
+        table.check_fits(1, 1, [0.1 * unit], None)
+
+
 def test_a_bound_rounded_to_float32_is_no_excess() -> None:
     data = example()
     data["actions"][:] = np.float32(0.1)  # 0.10000000149
