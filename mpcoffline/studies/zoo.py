@@ -322,7 +322,8 @@ def report(outcomes: Sequence[Outcome]) -> str:
         + "".join(f"; {o.plant} {o.seed} ({_pair(o.gain, o.gain_error)})" for o in s.worse),
         f"* Within 5 % of the yardstick: **{s.close} of {s.yardsticks}**",
         f"* Better than MPC_1 by more than 2 % where the yardstick is: **{s.better} of {s.room}**",
-        f"* Time in s of one core: fit {_range([o.fit_s for o in rows])}; build of its solver {_range([o.build_s for o in rows])}",
+        f"* Time in s of one core: fit {_range([o.fit_s for o in rows])}; "
+        f"build of its solver {_range([o.build_s for o in rows])}",
     ]
     lines += [f"* Failed: {o.plant} {o.seed}: {o.error}" for o in failed]
     judged = any(o.verdict for o in rows)
