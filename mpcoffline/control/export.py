@@ -39,7 +39,8 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
     ``mpc_controller.c`` solves with the algorithm of the ddp solver, one problem at a time and within a fixed number of
     iterations; the warm start lives in ``mpc_state``, theta in ``mpc_parameters``. ``mpc_test.c`` replays
     ``test_vectors.txt``, closed loops of the policy on its own model. y is the observation; past inputs that the MPC's
-    state holds besides are kept in ``mpc_state``.
+    state holds besides are kept in ``mpc_state``. Corners of the model are not rounded in C: it acts as the policy with
+    ``round_corners=False`` does.
 
     Args:
         policy: The policy, or the file of one or of a learner.

@@ -203,14 +203,10 @@ class Model(Component):
         return other
 
     def plus(self, addition: ca.Function) -> Self:
-        """The same model with something added to the plant's map, which is a discrete one then.
-
-        Args:
-            addition: A CasADi function ``(x, u) -> (n_states, 1)`` of the plant's states and the inputs that act.
-        """
+        """The same model with ``addition(x, u)`` on the plant's map, which is a discrete one then."""
         x, u, theta = (ca.SX.sym(name, *self.plant.size_in(i)) for i, name in enumerate("xup"))
-        other = copy.copy(self)
-        other._take(ca.Function("dynamics", [x, u, theta], [self.plant(x, u, theta) + addition(x, u)]), "map", None)
+        other, reached = copy.copy(self), self.plant(x, u, theta) + addition(x, u)
+        other._take(ca.Function("dynamics", [x, u, theta], [reached]), "map", None)
         return other
 
     def _first_scheme(self, ode: ca.Function, asked: Scheme | None) -> Scheme:

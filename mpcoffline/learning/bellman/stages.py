@@ -80,7 +80,8 @@ def identified(known: Known, config: StartConfig) -> Known:
     """The table without measurement noise, and the model, where it is learned, by its prediction error."""
     if config.init == "nominal":
         return known
-    found = identify(known.mpc, known.table, seed=known.seed)
+    tried = ["dead times"] if config.delays and known.value_function is None else []
+    found = identify(known.mpc, known.table, tried=tried, seed=known.seed)
     if "model" not in known.groups:
         return replace(known, table=found.table)
     known = replace(known, mpc=known.mpc.replace(model=found.model), table=found.table, model_error=found.error_after)
