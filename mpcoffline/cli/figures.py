@@ -142,12 +142,12 @@ def _task_of(learner: OfflineMPCLearner) -> str:
 
     nominal = learner.nominal_mpc
     for plant in PLANTS.values():
-        if (len(plant.observations), len(plant.inputs)) == (nominal.nx, nominal.nu):
+        if (len(plant.observations), len(plant.inputs)) == (nominal.ny, nominal.nu):
             return plant.id
     raise InvalidArgumentError(
         "learner",
         expected=f"one of a task that can be drawn ({', '.join(plant.id for plant in PLANTS.values())})",
-        actual=f"{nominal.nx} states and {nominal.nu} inputs",
+        actual=f"{nominal.ny} states and {nominal.nu} inputs",
     )
 
 

@@ -22,7 +22,7 @@ from .identification import OneStepProblem, Rows, without_jumps
 from .multi_step import Windows, open_loop
 from .plant import plant_rows
 from .small_network import SmallNetwork, fit_small_network
-from .structure import HeldOut
+from .structure import HeldOut, clearly_negative
 from .trajectories import Trajectories
 
 logger = logging.getLogger(__name__)
@@ -31,7 +31,6 @@ HIDDEN = (16, 16)
 STEPS = 15  # that are predicted open loop to judge it
 
 _ROWS = 20_000
-_CLEAR = 2.0  # standard errors beyond which a difference is no chance
 _LEAST = 1e-3  # of an increment: what is missed by less is not worth a network
 _FEW = 4  # episodes, below which windows are compared
 _ABSURD = 1e3
@@ -202,7 +201,7 @@ class _Missed:
     def gains(self, residual: Residual, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which states are predicted better on these rows, beyond chance, ``(nx,)``."""
         before, after = self._squares(residual, rows)
-        return np.array([_clear(a - b, self.episodes[rows]) for a, b in zip(after.T, before.T, strict=True)])
+        return np.array([clearly_negative(a - b, self.episodes[rows]) for a, b in zip(after.T, before.T, strict=True)])
 
     def judged(
         self, mpc: MPC, table: TransitionTable, residual: Residual, rows: NDArray[np.bool_], seed: int
@@ -219,8 +218,8 @@ class _Missed:
             residual.network,
             residual.outputs,
             residual.unit,
-            _clear(after.mean(axis=1) - before.mean(axis=1), self.episodes[rows])
-            and _clear(ends[1] - ends[0], np.arange(len(windows))),
+            clearly_negative(after.mean(axis=1) - before.mean(axis=1), self.episodes[rows])
+            and clearly_negative(ends[1] - ends[0], np.arange(len(windows))),
             share,
             one_step,
             (float(np.sqrt(ends[0].mean())), float(np.sqrt(ends[1].mean()))),
@@ -230,13 +229,3 @@ class _Missed:
         """Squared errors without and with it, ``(rows, nx)`` each."""
         x, u = np.split(self.inputs[rows], [len(self.unit)], axis=1)
         return self.errors[rows] ** 2, (self.errors[rows] - residual(x, u) / self.unit) ** 2
-
-
-def _clear(differences: Array, groups: NDArray[np.integer[Any]]) -> bool:
-    """Whether differences are below zero on average, beyond two standard errors; those of one group count as one."""
-    ids, group = np.unique(groups, return_inverse=True)
-    if len(ids) < _FEW:
-        group = np.arange(len(differences)) * 20 // max(len(differences), 1)
-    count = np.bincount(group)
-    means = np.bincount(group, weights=differences)[count > 0] / count[count > 0]
-    return len(means) > 1 and bool(means.mean() < -_CLEAR * means.std(ddof=1) / np.sqrt(len(means)))

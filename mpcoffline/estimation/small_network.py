@@ -17,11 +17,16 @@ _FLATTEST = 0.05  # variance of the flattest direction, in spreads: data of a co
 _REACH = 1.25  # times the largest target: the bound of an output
 _DAMPING = (1e-2, 1e-7, 1e8)  # at first, least, most
 _ATTEMPTS = 8
-_DECAY = 1e-6
+_DECAYS = (1e-2, 1e-3, 1e-4)  # of the targets' mean square, a weight squared; less only where it is worth it
+_WORTH = 0.95  # times the error on the data held out
 _BATCH = 1_500
 _STEPS = 60
 _PATIENCE = 12  # steps without a smaller error on the data held out
 _NARROW = 0.1  # of the size that random_layers gives to the output layer: the first guess is next to nothing
+
+
+Layers = tuple[list[Array], list[Array]]  # weights and biases
+Rows = tuple[Array, Array, Array]  # inputs, unit of each output, targets
 
 
 class Gate(NamedTuple):
@@ -91,7 +96,8 @@ def fit_small_network(
 ) -> SmallNetwork:
     """The network nearest to targets in mean square, by Levenberg and Marquardt (doi:10.1137/0111030).
 
-    Each step is on a random part of the rows; what is best on the rows held out is kept.
+    Each step is on a random part of the rows; what is best on the rows held out is kept. Weights are pulled towards
+    zero as much as these rows allow: a rough network fits noise, and makes plans on it hard to find.
 
     Args:
         data: Inputs ``(rows, n)`` and targets ``(rows, m)``, of which errors of one size mean the same.
@@ -102,47 +108,55 @@ def fit_small_network(
     gate = Gate.of(data[0])
     limit = np.maximum(_REACH * np.abs(data[1]).max(axis=0), np.finfo(np.float64).tiny)
     (z, open_), (z_stop, open_stop) = (gate.standardised(part[0]) for part in (data, stop))
-    weights, biases = random_layers((z.shape[1], *hidden, data[1].shape[1]), rng)
+    sizes, draw = (z.shape[1], *hidden, data[1].shape[1]), int(rng.integers(2**31))
+    batches, size = (z, open_[:, None] * limit, data[1]), float(np.mean(data[1] ** 2))
+    held_out = z_stop, open_stop[:, None] * limit, stop[1]
+    best, error = _descended(sizes, batches, held_out, _DECAYS[0] * size, np.random.default_rng(draw))
+    for decay in _DECAYS[1:]:
+        other, smaller = _descended(sizes, batches, held_out, decay * size, np.random.default_rng(draw))
+        if not smaller < _WORTH * error:
+            break
+        best, error = other, smaller
+    return SmallNetwork(gate, tuple(best[0]), tuple(best[1]), limit)
+
+
+def _descended(
+    sizes: tuple[int, ...], data: Rows, held_out: Rows, decay: float, rng: np.random.Generator
+) -> tuple[Layers, float]:
+    """Weights and biases with the smallest error on the rows held out, and that error."""
+    weights, biases = random_layers(sizes, rng)
     weights[-1], biases[-1] = _NARROW * weights[-1], 0.0 * biases[-1]
     p = np.concatenate([part.ravel() for part in (*weights, *biases)])
     shapes = [part.shape for part in (*weights, *biases)]
-
-    def held_out(flat: Array) -> float:
-        y = _signals(*_layers(flat, shapes), z_stop)[0][-1]
-        return float(np.mean((open_stop[:, None] * limit * y - stop[1]) ** 2))
-
-    best, least_error, since = p, held_out(p), 0
+    best, least_error, since = p, _error(_layers(p, shapes), *held_out), 0
     damping, least, most = _DAMPING
     for _ in range(_STEPS):
-        rows = rng.permutation(len(z))[:_BATCH]
-        batch = z[rows], open_[rows, None] * limit, data[1][rows]
+        rows = rng.permutation(len(data[0]))[:_BATCH]
+        batch = data[0][rows], data[1][rows], data[2][rows]
         curvature, slope, error = _normal_equations(_layers(p, shapes), *batch, len(p))
-        slope -= _DECAY * p
+        slope -= decay * p
         for _ in range(_ATTEMPTS):
-            diagonal = damping * (np.diag(curvature) + _DECAY) + _DECAY
+            diagonal = damping * (np.diag(curvature) + decay) + decay
             trial = p + np.linalg.solve(curvature + np.diag(diagonal), slope)
-            if _error(_layers(trial, shapes), *batch) + _DECAY * trial @ trial < error + _DECAY * p @ p:
+            if _error(_layers(trial, shapes), *batch) + decay * trial @ trial < error + decay * p @ p:
                 p, damping = trial, max(damping / 3.0, least)
                 break
             damping = min(4.0 * damping, most)
-        now = held_out(p)
+        now = _error(_layers(p, shapes), *held_out)
         best, least_error, since = (p, now, 0) if now < least_error else (best, least_error, since + 1)
         if since >= _PATIENCE:
             break
-    weights, biases = _layers(best, shapes)
-    return SmallNetwork(gate, tuple(weights), tuple(biases), limit)
+    return _layers(best, shapes), least_error
 
 
-def _layers(flat: Array, shapes: list[tuple[int, ...]]) -> tuple[list[Array], list[Array]]:
+def _layers(flat: Array, shapes: list[tuple[int, ...]]) -> Layers:
     """Weights and biases of a flat vector."""
     ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
     parts = [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
     return parts[: len(parts) // 2], parts[len(parts) // 2 :]
 
 
-def _signals(
-    weights: list[Array] | tuple[Array, ...], biases: list[Array] | tuple[Array, ...], z: Array
-) -> tuple[list[Array], list[Array]]:
+def _signals(weights: list[Array] | tuple[Array, ...], biases: list[Array] | tuple[Array, ...], z: Array) -> Layers:
     """The signals z, s(..), s(..), y, and the slopes of the three activations."""
     signals, slopes = [z], []
     for A, b in zip(weights, biases, strict=True):
@@ -153,13 +167,11 @@ def _signals(
     return signals, slopes
 
 
-def _error(layers: tuple[list[Array], list[Array]], z: Array, unit: Array, targets: Array) -> float:
+def _error(layers: Layers, z: Array, unit: Array, targets: Array) -> float:
     return float(np.sum((unit * _signals(*layers, z)[0][-1] - targets) ** 2) / len(z))
 
 
-def _normal_equations(
-    layers: tuple[list[Array], list[Array]], z: Array, unit: Array, targets: Array, size: int
-) -> tuple[Array, Array, float]:
+def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array, size: int) -> tuple[Array, Array, float]:
     """J'J, J'(targets - y) and the squared error, per row; J by back-propagation, one output after the other."""
     weights, biases = layers
     signals, slopes = _signals(weights, biases, z)

@@ -25,6 +25,7 @@ _STARTS = 5  # windows begin so many times a length
 _FEWEST = 8  # windows that anything is said of
 _HELD_OUT = 0.25
 _FEW_EPISODES = 4
+_CLEAR = 2.0  # standard errors beyond which a difference is no chance
 _ROWS = 3_000
 _OPERATIONS = 1e6  # of the model and its derivatives in a pass over the rows
 _LEAST_ROWS = 500
@@ -55,11 +56,12 @@ class MultiStepCheck:
 
     @property
     def suspicious(self) -> bool:
-        """Whether that is more than a tenth of an error that matters: structure, dead time or integrator are wrong.
+        """Whether that is more than a tenth of errors that matter: structure, dead time or integrator are wrong.
 
-        A right model predicts one step and many with the same parameters.
+        A right model predicts one step and many with the same parameters; on a plant that multiplies errors, what is
+        off by next to nothing after a few steps is right whatever comes after many.
         """
-        return self.gain > WORSE and self.errors[-1] > NEGLIGIBLE
+        return self.gain > WORSE and min(self.errors) > NEGLIGIBLE
 
     def having_tried(self, *what: str) -> MultiStepCheck:
         """The same, with more that was varied."""
@@ -117,15 +119,16 @@ def check_structure(
         if len(tested) >= _FEWEST:
             problem = MultiStepProblem(mpc, tested, coordinates, spread)
             steps.append(n)
-            errors.append(_error(problem, coordinates.z(theta)))
-            refitted.append(_error(problem, z))
+            ends = [_squares(problem, parameters) for parameters in (coordinates.z(theta), z)]
+            errors.append(float(np.sqrt(ends[0].mean())))
+            refitted.append(float(np.sqrt(ends[1].mean())))
     return MultiStepCheck(tuple(steps), tuple(errors), tuple(refitted)) if steps else None
 
 
-def _error(problem: MultiStepProblem, z: Array) -> float:
-    """Root mean square error after the last step, from the measured start."""
+def _squares(problem: MultiStepProblem, z: Array) -> Array:
+    """Mean square error after the last step from the measured start, of each window ``(W,)``."""
     last = problem.simulated(z, problem.windows.y[0], slopes=False).error[-1]
-    return float(np.sqrt(np.mean(last**2)))
+    return np.asarray(np.mean(last**2, axis=1))
 
 
 class HeldOut(NamedTuple):
@@ -154,3 +157,13 @@ class HeldOut(NamedTuple):
     def of_rows(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Whether these are held out."""
         return np.asarray(self.rows[rows])
+
+
+def clearly_negative(differences: Array, groups: NDArray[np.integer[Any]]) -> bool:
+    """Whether differences are below zero on average, beyond two standard errors; those of one group count as one."""
+    ids, group = np.unique(groups, return_inverse=True)
+    if len(ids) < _FEW_EPISODES:
+        group = np.arange(len(differences)) * 20 // max(len(differences), 1)
+    count = np.bincount(group)
+    means = np.bincount(group, weights=differences)[count > 0] / count[count > 0]
+    return len(means) > 1 and bool(means.mean() < -_CLEAR * means.std(ddof=1) / np.sqrt(len(means)))

@@ -24,7 +24,7 @@ from mpcoffline.core.types import Array
 Kind = Literal["free", "psd"]
 Group = Literal["model", "cost", "terminal", "reference"]
 
-_PSD_TOLERANCE = 1e-9
+_PSD_TOLERANCE = 1e-9  # relative to the diagonal
 _PREFIX = 20  # characters that an MPC puts in front of a name
 
 
@@ -363,24 +363,41 @@ def psd_factor(matrix: Array, name: str = "matrix") -> Array:
         raise InvalidArgumentError(name, expected="a square matrix", actual=f"shape {matrix.shape}")
     if not np.isfinite(matrix).all():
         raise InvalidArgumentError(name, expected="finite entries", actual=str(matrix.tolist()))
-    scale = max(1.0, float(np.abs(matrix).max()))
-    asymmetry = float(np.abs(matrix - matrix.T).max())
-    if asymmetry > _PSD_TOLERANCE * scale:
+    units = _units(matrix)
+    scaled = matrix / units[:, None] / units
+    asymmetry = np.abs(scaled - scaled.T)
+    if asymmetry.max(initial=0.0) > _PSD_TOLERANCE:
+        i, j = np.unravel_index(int(asymmetry.argmax()), asymmetry.shape)
         raise InvalidArgumentError(
             name,
             expected="a symmetric matrix",
-            actual=f"entries that differ from their mirror by {asymmetry:.3g}",
+            actual=f"entries that differ from their mirror by {abs(matrix[i, j] - matrix[j, i]):.3g}",
         )
-    eigenvalues, vectors = np.linalg.eigh((matrix + matrix.T) / 2.0)
-    if eigenvalues[0] < -_PSD_TOLERANCE * scale:
+    if np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -_PSD_TOLERANCE:
+        smallest = np.linalg.eigvalsh((matrix + matrix.T) / 2.0)[0]
         raise InvalidArgumentError(
-            name,
-            expected="a positive semidefinite matrix",
-            actual=f"smallest eigenvalue {eigenvalues[0]:.3g}",
+            name, expected="a positive semidefinite matrix", actual=f"smallest eigenvalue {smallest:.3g}"
         )
+    symmetric = (matrix + matrix.T) / 2.0
     try:
-        return np.asarray(np.linalg.cholesky((matrix + matrix.T) / 2.0))
-    except np.linalg.LinAlgError:  # singular: QR of the symmetric square root's factor
-        upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T).R
-        signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
-        return np.asarray((upper * signs[:, None]).T)
+        return np.asarray(np.linalg.cholesky(symmetric))
+    except np.linalg.LinAlgError:  # singular
+        factor = _singular_factor(symmetric)
+    if (np.abs(factor @ factor.T - symmetric) > _PSD_TOLERANCE * np.outer(units, units)).any():  # of unequal units
+        factor = units[:, None] * _singular_factor((scaled + scaled.T) / 2.0)
+    return factor
+
+
+def _units(matrix: Array) -> Array:
+    """What each row and column of a weight is measured by: the root of its diagonal element, else of the largest."""
+    largest = float(np.abs(matrix).max(initial=0.0))
+    diagonal = np.diag(matrix)
+    return np.asarray(np.sqrt(np.where(diagonal > 0.0, diagonal, largest if largest > 0.0 else 1.0)))
+
+
+def _singular_factor(matrix: Array) -> Array:
+    """The lower-triangular factor of a symmetric matrix without its negative eigenvalues: QR of its root's factor."""
+    eigenvalues, vectors = np.linalg.eigh(matrix)
+    upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T).R
+    signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
+    return np.asarray((upper * signs[:, None]).T)

@@ -52,11 +52,11 @@ def cost_figure(
     plane = plane_of(plant)
     mpcs = (nominal, learned)
     for mpc in mpcs:
-        if (mpc.nx, mpc.nu) != (len(plant.observations), len(plant.inputs)):
+        if (mpc.ny, mpc.nu) != (len(plant.observations), len(plant.inputs)):
             raise InvalidArgumentError(
                 "MPC",
                 expected=f"{len(plant.observations)} states and {len(plant.inputs)} inputs, as in the environment",
-                actual=f"{mpc.nx} and {mpc.nu}",
+                actual=f"{mpc.ny} and {mpc.nu}",
             )
     weights = [stage_weights(mpc) for mpc in mpcs]
     landscapes = [on_plane(task, plane, partial(_stage_cost, mpc)) for mpc in mpcs]
@@ -76,14 +76,15 @@ def cost_figure(
 
 
 def stage_weights(mpc: MPC) -> Array:
-    """Half the Hessian of the stage cost in (x, u) at the reference, ``(nx + nu, nx + nu)``.
+    """Half the Hessian of the stage cost in observation and input at the reference, ``(ny + nu, ny + nu)``.
 
     Of a quadratic cost this is [[W, S], [S', R]] of (COST).
     """
-    x, u = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu)
-    hessian, _ = ca.hessian(mpc.stage_function(x, u, mpc.theta), ca.vertcat(x, u))
+    x, u = ca.SX.sym("x", mpc.ny), ca.SX.sym("u", mpc.nu)
+    z = ca.vertcat(x, ca.DM(mpc.layout.filled(mpc.usual_input)))
+    hessian, _ = ca.hessian(mpc.stage_function(z, u, mpc.theta), ca.vertcat(x, u))
     values = mpc.values
-    at = [values.get(f"stage_cost.{name}", np.zeros(size)) for name, size in (("x_ref", mpc.nx), ("u_ref", mpc.nu))]
+    at = [values.get(f"stage_cost.{name}", np.zeros(size)) for name, size in (("x_ref", mpc.ny), ("u_ref", mpc.nu))]
     return np.asarray(0.5 * ca.Function("H", [x, u], [hessian])(*at).full())
 
 
@@ -123,7 +124,7 @@ def _number(value: float, largest: float, *, exact: bool) -> str:
 
 def _stage_cost(mpc: MPC, y: Array) -> Array:
     """Lhat(y, 0) of observations ``(m, ny)``, ``(m,)``."""
-    return np.asarray(mpc.stage_function(y.T, np.zeros((mpc.nu, len(y))), mpc.theta).full()[0])
+    return np.asarray(mpc.stage_function(mpc.state(y).T, np.zeros((mpc.nu, len(y))), mpc.theta).full()[0])
 
 
 def _entries(plant: Plant) -> list[str]:

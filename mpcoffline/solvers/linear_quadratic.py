@@ -1,6 +1,7 @@
 """The linear-quadratic special case of (MPC): its matrices, its Riccati recursion, and the QP that input bounds make.
 
-With z = (x, u), and an index k on all matrices where theta is given for each stage::
+With z = (x, u) - (x_ref, u_ref), so that no digits are lost far from zero, and an index k on all matrices where theta
+is given for each stage::
 
     f_th(x, u) = A x + B u + c,      Lhat_th(x, u) = z'H z + 2 h'z + l,      T_th(x) = x'W x + 2 w'x + t
 """
@@ -16,7 +17,7 @@ import numpy as np
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, StageCost, TerminalCost, expressions
 
-_TOUCHING = 1e-9  # distance from a bound that counts as none, relative to 1 + |u|
+_TOUCHING = 1e-9  # distance from a bound that counts as none, relative to the range or, without one, to |u|
 _SINGULAR = 1e-13  # of a Hessian's diagonal, below which a pivot counts as zero
 
 
@@ -70,6 +71,8 @@ class LinearQuadratic:
         w: ``(nx,)``.
         t: Scalar.
         discount: gamma.
+        x_ref: What states are counted from, ``(nx,)``.
+        u_ref: What inputs are counted from, ``(nu,)``.
     """
 
     A: Array
@@ -82,6 +85,8 @@ class LinearQuadratic:
     w: Array
     t: float
     discount: float
+    x_ref: Array
+    u_ref: Array
 
     @property
     def horizon(self) -> int:
@@ -129,26 +134,32 @@ class LinearQuadratic:
 
         The problem is convex, so that they decide: the dynamics, the recursion of the costates, and at each stage
         either a zero gradient or one that points out of the bounds. Everything is computed from the problem's own
-        matrices, whatever the trajectories and costates come from. ``affine (B,)`` scales c, h and w.
+        matrices, whatever the trajectories and costates come from; each element is compared with its own terms, so that
+        no unit matters. ``affine (B,)`` scales c, h and w.
         """
         nx = x.shape[2]
         c, h, w = (np.multiply.outer(np.asarray(affine), part) for part in (self.c, self.h, self.w))
         z = np.concatenate([x[:, :-1], u], axis=2)
         AB = np.concatenate([self.A, self.B], axis=2)
-        dynamics = x[:, 1:] - (_times(AB, z) + c)
-        own, ahead = _times(self.H, z) + h, self.discount * _times(AB.transpose(0, 2, 1), costates[:, 1:])
-        gradient = own + ahead
-        last = costates[:, -1] - (x[:, -1] @ self.W + w)
+        ABt = self.discount * AB.transpose(0, 2, 1)
+        gradient = _times(self.H, z) + h + _times(ABt, costates[:, 1:])
+        terms = _times(abs(self.H), abs(z)) + abs(h) + _times(abs(ABt), abs(costates[:, 1:]))
         slope = gradient[:, :, nx:]
         room = np.where(slope > 0.0, u - low, high - u)  # in the direction of descent
-        slope = np.where(room <= _TOUCHING * (1.0 + np.abs(u)), 0.0, slope)
-        adjoint = gradient[:, :, :nx] - costates[:, :-1]
-        # Stage by stage: where the states grow along the horizon, the last ones must not hide the errors of the first.
-        scale = 1.0 + _largest(own) + _largest(ahead)
-        stages = np.maximum(_largest(adjoint), _largest(slope)) / scale
-        stages = np.maximum(stages, _largest(dynamics) / (1.0 + _largest(z)))
-        end = _largest(last) / (1.0 + _largest(costates[:, -1]))
-        return np.asarray(np.maximum(stages.max(axis=1, initial=0.0), end))
+        bound = np.where(slope > 0.0, low, high)
+        known = np.where(np.isfinite(bound), abs(bound), 0.0)
+        slope = np.where(room <= _TOUCHING * np.minimum(high - low, known + abs(u)), 0.0, slope)
+        adjoint, here = gradient[:, :, :nx] - costates[:, :-1], terms[:, :, :nx] + abs(costates[:, :-1])
+        dynamics, moved = x[:, 1:] - (_times(AB, z) + c), abs(x[:, 1:]) + _times(abs(AB), abs(z)) + abs(c)
+        last = costates[:, -1] - (x[:, -1] @ self.W + w)
+        end = abs(x[:, -1]) @ abs(self.W) + abs(w) + abs(costates[:, -1])
+        residuals = (
+            _relative(adjoint, here),
+            _relative(slope, terms[:, :, nx:]),
+            _relative(dynamics, moved),
+            _relative(last[:, None], np.maximum(end, here.max(axis=1, initial=0.0))[:, None]),
+        )
+        return np.asarray(np.maximum.reduce([part.max(axis=(1, 2), initial=0.0) for part in residuals]))
 
 
 class Extraction:
@@ -170,12 +181,24 @@ class Extraction:
         self._stage = ca.Function("stage", [z, theta], [ca.densify(part) for part in parts])
         self._terminal = ca.Function("terminal", [x, theta], [ca.densify(part) for part in (P / 2, p / 2, terminal)])
         self._mpc = mpc
+        # Where states and inputs are counted from; zero where the costs have no reference.
+        self._references = [
+            next((mpc.space.slices[name] for name in names if _is_vector(mpc, name, size)), None)
+            for names, size in (
+                (("stage_cost.x_ref", "terminal_cost.x_ref"), mpc.nx),
+                (("stage_cost.u_ref",), mpc.nu),
+            )
+        ]
 
     def __call__(self, theta: Array) -> LinearQuadratic:
         """The matrices for theta ``(size,)``, or ``(N + 1, size)`` with one theta a stage."""
         mpc, n = self._mpc, self._mpc.horizon
         rows = np.atleast_2d(theta)
-        origin = np.zeros(mpc.nx + mpc.nu)
+        x_ref, u_ref = (
+            np.zeros(size) if part is None else rows[0, part]
+            for part, size in zip(self._references, (mpc.nx, mpc.nu), strict=True)
+        )
+        origin = np.r_[x_ref, u_ref]
         stages = [[part.full() for part in self._stage(origin, row)] for row in (rows[:-1] if len(rows) > 1 else rows)]
         AB, c, H, h, offset = (
             np.broadcast_to(np.stack(parts), (n, *parts[0].shape)) for parts in zip(*stages, strict=True)
@@ -183,7 +206,8 @@ class Extraction:
         P, p, v = (part.full() for part in self._terminal(origin[: mpc.nx], rows[-1]))
         A, B = AB[:, :, : mpc.nx], AB[:, :, mpc.nx :]
         terminal = P, p[:, 0], float(v[0, 0])
-        return LinearQuadratic(A, B, c[..., 0], H, h[..., 0], offset[:, 0, 0], *terminal, mpc.discount)
+        steps = c[..., 0] - x_ref
+        return LinearQuadratic(A, B, steps, H, h[..., 0], offset[:, 0, 0], *terminal, mpc.discount, x_ref, u_ref)
 
 
 class Riccati:
@@ -243,22 +267,18 @@ class Riccati:
         """V_0 of states ``(B, nx)``, ``(B,)``."""
         return np.asarray(((x @ self.P[0] + 2.0 * self.p[0]) * x).sum(axis=1) + self.v[0])
 
-    def residual(self, x: Array) -> Array:
-        """A bound on :meth:`LinearQuadratic.optimality` of :meth:`trajectories`, ``(B,)``, at the cost of one product.
-
-        Without bounds the first-order conditions are affine in x: they are computed once, for a basis.
-        """
-        return np.asarray(np.abs(x) @ self._basis_residuals[:-1] + self._basis_residuals[-1])
-
     @cached_property
-    def _basis_residuals(self) -> Array:
-        """Residuals of the first-order conditions for x = 0 (last) and what each unit vector adds, ``(nx + 1,)``."""
+    def residual(self) -> float:
+        """A bound on :meth:`LinearQuadratic.optimality` of all :meth:`trajectories`.
+
+        Without bounds they are sums of what x = 0 and each unit vector give, of which this is the largest residual.
+        """
         _, nx, nu = self.problem.B.shape
         z = np.eye(nx + 1)
         x, u = self._closed_loop(z)
-        return self.problem.optimality(
-            x, u, _times(self.P, x) + self.p * z[:, nx, None, None], np.full(nu, -np.inf), np.full(nu, np.inf), z[:, nx]
-        )
+        costates = _times(self.P, x) + self.p * z[:, nx, None, None]
+        bounds = np.full(nu, -np.inf), np.full(nu, np.inf)
+        return float(self.problem.optimality(x, u, costates, *bounds, z[:, nx]).max())
 
     def trajectories(self, x: Array) -> tuple[Array, Array]:
         """The best states ``(B, N + 1, nx)`` and inputs ``(B, N, nu)`` without bounds, from states ``(B, nx)``."""
@@ -312,7 +332,7 @@ def _cholesky(matrix: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     pivots = np.diag(factor) ** 2
-    return factor if (pivots > _SINGULAR * np.maximum(np.diag(matrix), 0.0).max(initial=0.0)).all() else None
+    return factor if (pivots > _SINGULAR * np.diag(matrix)).all() else None
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
@@ -320,6 +340,16 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray(np.matmul(matrices, vectors[..., None])[..., 0])
 
 
-def _largest(array: Array) -> Array:
-    """The largest magnitude along the last axis."""
-    return np.asarray(np.abs(array).max(axis=-1, initial=0.0))
+def _relative(errors: Array, terms: Array) -> Array:
+    """Magnitudes of errors ``(B, N, i)`` relative to the largest of their terms so far along the stages, 0 where none.
+
+    So far: where the states grow along the horizon, the last ones must not hide the errors of the first; where they
+    vanish, the last ones are exact to a part of the first.
+    """
+    sizes = np.maximum.accumulate(terms, axis=1)
+    return np.asarray(np.abs(errors) / np.where(sizes > 0.0, sizes, 1.0))
+
+
+def _is_vector(mpc: MPC, name: str, size: int) -> bool:
+    """Whether there is a parameter of that name and shape ``(size,)``."""
+    return any(block.name == name and block.shape == (size,) for block in mpc.space)

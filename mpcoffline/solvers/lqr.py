@@ -35,7 +35,7 @@ class LQRSolver(Solver):
     to try first. Where daqp fails (unstable models that saturated inputs cannot hold), ipopt takes over.
 
     ``success`` says that the first-order conditions hold along the trajectory, which is decisive as the problem is
-    convex; ``stats["residual"]`` says how well, relative to the size of their terms.
+    convex; ``stats["residual"]`` says how well, each relative to the size of its own terms.
 
     A theta whose Hessian with respect to the inputs is singular or indefinite at some stage (inputs free of cost
     that also change nothing that costs) has no unique solution: its problems are passed on to ipopt, and
@@ -127,7 +127,8 @@ class _Controller:
     """What is computed once a theta."""
 
     def __init__(self, problem: LinearQuadratic, low: Array, high: Array) -> None:
-        self._problem, self._low, self._high = problem, low, high
+        self._problem, self._bounds = problem, (low, high)
+        self._low, self._high = low - problem.u_ref, high - problem.u_ref
         self._free = Riccati(problem)
         self._rest: Riccati | None = None
         self._programs: dict[bool, _BoundedInputs] = {}
@@ -145,17 +146,18 @@ class _Controller:
 
     def solve(self, x: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         """The problems from ``x (B, nx)``; with ``u0 (B, nu)`` given, the rest of them from its successor."""
-        problem, imposed = self._problem, u0 is not None
+        problem, imposed, given, first = self._problem, u0 is not None, x, u0
         riccati, skipped = self._riccati(imposed), int(imposed)
+        x, u0 = x - problem.x_ref, None if u0 is None else u0 - problem.u_ref
         begin = x if u0 is None else x @ problem.A[0].T + u0 @ problem.B[0].T + problem.c[0]
         states, inputs = riccati.trajectories(begin)
-        value, residual = riccati.value(begin), riccati.residual(begin)
+        value, residual = riccati.value(begin), np.full(len(x), riccati.residual)
         iterations, words = np.zeros(len(x), dtype=np.int64), ["Riccati"] * len(x)
         rows = np.flatnonzero(((inputs < self._low) | (inputs > self._high)).any(axis=(1, 2)))
         if len(rows):
             program, rest = self._program(imposed, riccati), riccati.problem
             for i in rows:
-                guess = None if warm_start is None else warm_start.u[i, skipped:]
+                guess = None if warm_start is None else warm_start.u[i, skipped:] - problem.u_ref
                 inputs[i], iterations[i], words[i] = program.solve(inputs[i], guess)
             states[rows] = rest.rollout(begin[rows], inputs[rows])
             bounded = states[rows], inputs[rows]
@@ -171,8 +173,11 @@ class _Controller:
             value = stage + problem.discount * value
             states = np.concatenate([x[:, None], states], axis=1)
             inputs = np.concatenate([u0[:, None], inputs], axis=1)
-        else:
-            states[:, 0] = x
+        states, inputs = states + problem.x_ref, inputs + problem.u_ref
+        states[:, 0] = given
+        inputs = np.clip(inputs, *self._bounds)
+        if first is not None:
+            inputs[:, 0] = first
         stats: Stats = {"iterations": iterations, "time": 0.0, "residual": residual, "words": words}
         return Solution(inputs[:, 0].copy(), states, inputs, value, success, status, stats)
 
@@ -194,34 +199,39 @@ class _BoundedInputs:
     def __init__(self, G: Array, low: Array, high: Array) -> None:
         n = len(G)
         self._G, self._low, self._high = G, low, high
+        # daqp's tolerances are absolute: its rows are of length 1, its bounds the violations relative to the largest.
+        lengths = np.linalg.norm(G, axis=1)
+        self._lengths = np.where(lengths > 0.0, lengths, 1.0)
         self._model = daqp.Model()
         self._model.settings = _SETTINGS
-        wide = np.full(n, _INFINITE)
+        wide, rows = np.full(n, _INFINITE), np.ascontiguousarray(G / self._lengths[:, None])
         # Whether daqp copies what it is given or points to it: all of it lives as long as this object.
-        self._data = (np.eye(n), np.zeros(n), np.ascontiguousarray(G), wide, -wide, np.zeros(n, dtype=np.intc))
+        self._data = (np.eye(n), np.zeros(n), rows, wide, -wide, np.zeros(n, dtype=np.intc))
         self._model.setup(*self._data)
 
     def solve(self, u: Array, guess: Array | None) -> tuple[Array, int, str]:
         """The best inputs within the bounds ``(N, nu)``, iterations, and how it went.
 
         Args:
-            u: The inputs without bounds, ``(N, nu)``.
+            u: The inputs without bounds, ``(N, nu)``, some of them beyond.
             guess: Inputs of a plan ``(N, nu)``, whose active bounds are tried first; None, or NaN, for none.
         """
         sense = np.zeros(u.size, dtype=np.intc)
         if guess is not None:
             sense[(guess >= self._high).ravel()] = _UPPER
             sense[(guess <= self._low).ravel()] = _LOWER
-        upper = np.minimum(self._high - u, _INFINITE).ravel()
-        lower = np.maximum(self._low - u, -_INFINITE).ravel()
-        self._model.update(bupper=upper, blower=lower, sense=sense)
+        upper, lower = ((bound - u).ravel() / self._lengths for bound in (self._high, self._low))
+        largest = max(float(lower.max()), float(-upper.min()))
+        self._model.update(
+            bupper=np.minimum(upper / largest, _INFINITE), blower=np.maximum(lower / largest, -_INFINITE), sense=sense
+        )
         w, _, flag, info = self._model.solve()
         iterations = int(info["iterations"])
         if flag <= 0 or not np.isfinite(w).all():
             # A guess that the conditions of an optimum then confirm, or refute.
             reason = f"clipped Riccati, as daqp says {_REASONS.get(flag, flag)}"
             return np.clip(u, self._low, self._high), iterations, reason
-        return np.clip(u + (self._G @ w).reshape(u.shape), self._low, self._high), iterations, "QP"
+        return np.clip(u + largest * (self._G @ w).reshape(u.shape), self._low, self._high), iterations, "QP"
 
 
 def _part(plan: Plan | None, rows: NDArray[np.intp]) -> Plan | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -69,22 +69,36 @@ def _sum(a: ca.SX | None, b: ca.SX | None, sign: int) -> ca.SX | None:
     return sign * b if a is None else a + b if sign > 0 else a - b
 
 
-def without_constants(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Stage and terminal cost without their constants, see :func:`split_constant`, and what these add to V_theta.
+class Costs(NamedTuple):
+    """The costs of an MPC without their constants, see :func:`split_constant`, and these.
 
-    A closed form: ``sum_k gamma^k l + gamma^N t`` of the constants l, t, which may depend on theta.
+    Attributes:
+        stage: The stage cost.
+        terminal: The terminal cost.
+        offset: The constant of the stage cost; it may depend on theta.
+        last: That of the terminal cost.
     """
+
+    stage: ca.SX
+    terminal: ca.SX
+    offset: ca.SX
+    last: ca.SX
+
+
+def costs_of(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> Costs:
+    """The costs at symbols x ``(nx, 1)``, u ``(nu, 1)``, and theta."""
     stage, offset = split_constant(mpc.stage_function(x, u, theta), ca.vertcat(x, u))
-    final, last = split_constant(mpc.terminal_function(x, theta), x)
-    weights = mpc.discount ** np.arange(mpc.horizon + 1)
-    return stage, final, float(weights[:-1].sum()) * offset + float(weights[-1]) * last
+    terminal, last = split_constant(mpc.terminal_function(x, theta), x)
+    return Costs(stage, terminal, offset, last)
 
 
 def cost_constant(mpc: MPC) -> ca.Function:
-    """What the constants of the costs add to V_theta, as CasADi function ``theta -> number``."""
+    """What the constants l, t of the costs add to V_theta, ``sum_k gamma^k l + gamma^N t``, as ``theta -> number``."""
     theta = ca.SX.sym("theta", mpc.space.size)
-    symbols = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), theta
-    return ca.Function("constant", [theta], [ca.densify(without_constants(mpc, *symbols)[2])])
+    costs = costs_of(mpc, ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), theta)
+    weights = mpc.discount ** np.arange(mpc.horizon + 1)
+    total = float(weights[:-1].sum()) * costs.offset + float(weights[-1]) * costs.last
+    return ca.Function("constant", [theta], [ca.densify(total)])
 
 
 def input_units(mpc: MPC) -> Array:

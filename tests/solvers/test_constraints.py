@@ -217,7 +217,7 @@ class _Claims:
     ("changes", "expected"),
     [
         ({"x": lambda w: 0.9 * w}, "not optimal"),
-        ({"lam_g": lambda m: 1.1 * m}, "not optimal"),
+        ({"x": lambda w: 0.99 * w}, "not optimal"),
         ({"x": lambda w: w * np.nan}, "not finite"),
     ],
 )

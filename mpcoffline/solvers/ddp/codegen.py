@@ -13,7 +13,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layers import layered
 from mpcoffline.solvers.linear_quadratic import promises_convexity
-from mpcoffline.solvers.scaling import without_constants
+from mpcoffline.solvers.scaling import costs_of
 
 from .elimination import value_and_jacobian
 from .emission import emit
@@ -49,7 +49,7 @@ def generated(mpc: MPC) -> str:
     curvature, discount = ca.SX.sym("Vxx", mpc.nx * (mpc.nx + 1) // 2), ca.SX.sym("discount")
     z = ca.vertcat(x, u)
     reached = mpc.dynamics_function(x, u, theta)
-    cost, final, _ = without_constants(mpc, x, u, theta)
+    cost, final, *_ = costs_of(mpc, x, u, theta)
     layers = _layers(mpc, theta) if ca.n_nodes(reached) > _LARGEST_BENT else None
     _check_size(mpc, ca.vertcat(cost, final), layers.n_scalars if layers else ca.n_nodes(reached))
     final_hessian, final_gradient = ca.hessian(final, x)

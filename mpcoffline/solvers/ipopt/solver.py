@@ -29,6 +29,9 @@ class IpoptSolver(Solver):
     polishes the best with the exact Hessian. A warm start goes to the exact Hessian at once. The starting points are
     fixed by a seed at construction, so that equal calls give equal results.
 
+    ipopt sees variables, constraints and cost in units that each start's trajectory gives, so that its absolute
+    tolerances fit; results are judged in those of the solution.
+
     What is returned is the model run with the inputs found, within their bounds, and what that costs. ``success`` says
     that this trajectory violates no constraint and that the first-order conditions hold at it
     (``stats["residual"]``), whatever ipopt returned. Otherwise ``words`` say what is wrong, e.g.
@@ -37,7 +40,7 @@ class IpoptSolver(Solver):
     Args:
         mpc: The problem.
         n_starts: Starting points of a cold solve; by default 4, and 1 where the problem is convex.
-        tolerance: ipopt's relative convergence tolerance.
+        tolerance: ipopt's relative convergence tolerance, in these units.
         max_iterations: Bound on the iterations of each ipopt call.
         max_time: Bound on the time of a problem in s, shared out among its calls of ipopt, of which there are up to two
             more than starts. What it cuts short is not accepted, but returned.

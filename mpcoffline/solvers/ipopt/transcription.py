@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Penalty
+from mpcoffline.solvers.scaling import costs_of
 from mpcoffline.solvers.starts import N_CANDIDATES
+
+from .units import Units, costates
 
 
 class Multipliers(NamedTuple):
@@ -22,6 +26,24 @@ class Multipliers(NamedTuple):
     """
 
     bounds: Array
+    constraints: Array
+
+
+class Expansion(NamedTuple):
+    """A program to first order.
+
+    Attributes:
+        rows: Of the elements of the Jacobian of the constraints that are not always zero.
+        columns: Their variables.
+        slopes: These elements.
+        gradient: Of the objective, ``(n,)``.
+        constraints: Their values, ``(m,)``.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    slopes: Array
+    gradient: Array
     constraints: Array
 
 
@@ -39,7 +61,7 @@ class Transcription:
     Attributes:
         variables: ``(n, 1)``.
         parameters: ``(nx + size of theta, 1)``.
-        cost: The objective.
+        cost: The objective, without the constants of the costs.
         constraints: ``(m, 1)``.
         constraint_low: ``(m,)``; the upper bounds are all zero.
         soft: All soft constraints h, as many as slacks.
@@ -49,6 +71,7 @@ class Transcription:
     def __init__(self, mpc: MPC, stagewise: bool = False) -> None:
         self.mpc, self.stagewise = mpc, stagewise
         n, size = mpc.horizon, mpc.space.size
+        self._stage, self._terminal, self._constants = _cost_functions(mpc)
         self._state = ca.SX.sym("s", mpc.nx)
         self._theta = ca.SX.sym("theta", size, n + 1 if stagewise else 1)
         self._inputs = [ca.SX.sym(f"u{k}", mpc.nu) for k in range(n)]
@@ -79,11 +102,11 @@ class Transcription:
         return self._theta[:, k] if self.stagewise else self._theta
 
     def _objective(self) -> ca.SX:
-        """gamma^N T_th(x_N) + sum_{k<N} gamma^k Lhat_th(x_k, u_k)."""
+        """gamma^N T_th(x_N) + sum_{k<N} gamma^k Lhat_th(x_k, u_k), without constants."""
         mpc, n = self.mpc, self.mpc.horizon
-        cost = mpc.discount**n * mpc.terminal_function(self._states[n], self.theta_at(n))
+        cost = mpc.discount**n * self._terminal(self._states[n], self.theta_at(n))
         for k in range(n):
-            cost += mpc.discount**k * mpc.stage_function(self._states[k], self._inputs[k], self.theta_at(k))
+            cost += mpc.discount**k * self._stage(self._states[k], self._inputs[k], self.theta_at(k))
         return cost
 
     def _defects(self) -> list[ca.SX]:
@@ -170,27 +193,83 @@ class Transcription:
 
     @cached_property
     def _lagrangian(self) -> ca.Function:
-        """``(variables, p, multipliers) -> gradient of the cost, of the Lagrangian, constraints``."""
+        """``(variables, p, multipliers) -> gradient of the Lagrangian, constraints``."""
         multipliers = ca.SX.sym("lam", self.constraints.numel())
         gradient = ca.gradient(self.cost, self.variables)
         total = gradient + ca.jtimes(self.constraints, self.variables, multipliers, True)
         arguments = [self.variables, self.parameters, multipliers]
-        return ca.Function("lagrangian", arguments, [gradient, total, self.constraints])
+        return ca.Function("lagrangian", arguments, [total, self.constraints])
 
-    def violation(self, w: Array, p: Array) -> tuple[float, str]:
-        """The largest violation of a hard constraint or state bound, and its name and stage."""
+    @cached_property
+    def constant(self) -> ca.Function:
+        """``p -> number``: what the constants of the costs add to the objective."""
+        n, discount = self.mpc.horizon, self.mpc.discount
+        total = discount**n * self._constants(self.theta_at(n))[1]
+        for k in range(n):
+            total += discount**k * self._constants(self.theta_at(k))[0]
+        return ca.Function("constant", [self.parameters], [ca.densify(total)])
+
+    def reference(self, p: Array) -> list[Array]:
+        """The state that the costs pull to, by the theta in p: none, or ``(nx,)`` for each theta."""
+        thetas = p[self.mpc.nx :].reshape(-1, self.mpc.space.size)
+        for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
+            part = self.mpc.space.slices.get(name)
+            if part is not None and part.stop - part.start == self.mpc.nx:
+                return list(thetas[:, part])
+        return []
+
+    def expansion(self, w: Array, p: Array) -> Expansion:
+        """The program to first order at a point."""
+        rows, columns = self._places
+        found = self._expansion(w, p).full().ravel()
+        slopes, gradient, constraints = np.split(found, [len(rows), len(rows) + len(w)])
+        return Expansion(rows, columns, slopes, gradient, constraints)
+
+    @cached_property
+    def _expansion(self) -> ca.Function:
+        jacobian, gradient = ca.jacobian(self.constraints, self.variables), ca.gradient(self.cost, self.variables)
+        elements: list[Any] = jacobian.nonzeros()
+        column = ca.vertcat(
+            ca.vertcat(*elements),
+            ca.densify(gradient),
+            ca.densify(self.constraints),
+        )
+        return ca.Function("expansion", [self.variables, self.parameters], [column])
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        jacobian = ca.Function("g", [self.variables, self.parameters], [self.constraints]).jac_sparsity(0, 0)
+        rows, columns = jacobian.get_triplet()
+        return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
+
+    def gradient(self, w: Array, p: Array) -> Array:
+        """Of the objective by the variables, ``(n,)``."""
+        return np.asarray(self._gradient(w, p).full().ravel())
+
+    @cached_property
+    def _gradient(self) -> ca.Function:
+        gradient = ca.densify(ca.gradient(self.cost, self.variables))
+        return ca.Function("gradient", [self.variables, self.parameters], [gradient])
+
+    def violation(self, w: Array, p: Array, units: Units) -> tuple[float, float, str]:
+        """The hard constraint or state bound that is violated most: by how many units, by how much, name and stage."""
+        n_defects = self.mpc.horizon * self.mpc.nx
         h = self.appraise(w, p)[1].full().ravel()
         low, high = self._state_bounds
         x, _ = self.unpack(w)
+        state_units, _ = self.unpack(units.variables)
         excess = np.maximum(x - high, low - x)  # -inf where there is no bound
-        worst, where = 0.0, ""
-        if h.size and h.max() > worst:
-            name, stage = self.labels[int(h.argmax())]
-            worst, where = float(h.max()), f"{name!r} at stage {stage}"
-        if excess.max(initial=-np.inf) > worst:
-            k, i = np.unravel_index(int(excess.argmax()), excess.shape)
-            worst, where = float(excess[k, i]), f"{self._bound_name(int(i), x[k, i] > high[i])!r} at stage {k + 1}"
-        return worst, where
+        in_units = h / units.constraints[n_defects : n_defects + h.size], excess / state_units
+        worst, amount, where = 0.0, 0.0, ""
+        if h.size and in_units[0].max() > worst:
+            j = int(in_units[0].argmax())
+            name, stage = self.labels[j]
+            worst, amount, where = float(in_units[0][j]), float(h[j]), f"{name!r} at stage {stage}"
+        if in_units[1].max(initial=-np.inf) > worst:
+            k, i = np.unravel_index(int(in_units[1].argmax()), excess.shape)
+            where = f"{self._bound_name(int(i), x[k, i] > high[i])!r} at stage {k + 1}"
+            worst, amount = float(in_units[1][k, i]), float(excess[k, i])
+        return worst, amount, where
 
     def _bound_name(self, i: int, above: bool) -> str:
         """The name of the hard state bound that is the tightest for a state."""
@@ -201,29 +280,50 @@ class Transcription:
                 return f"{bounds.name}[{i}]"
         raise KeyError(i)
 
-    def optimality(self, w: Array, p: Array, u0: Array | None, multipliers: Multipliers) -> float:
+    def optimality(self, w: Array, p: Array, u0: Array | None, multipliers: Multipliers, units: Units) -> float:
         """How far the conditions of Karush, Kuhn and Tucker are from holding, relative to the size of their terms.
 
         Stationarity of the Lagrangian, signs and complementarity of the multipliers, computed from the problem's
-        functions at the point given; feasibility is the business of :meth:`violation`.
+        functions at the point given, all as changes of the cost over a unit; feasibility is the business of
+        :meth:`violation`. The multipliers of the model and of the inputs' bounds are not asked for: with those that
+        make the Lagrangian stationary in the states, what is left is by the inputs, as small as their effects may be.
         """
         low, high = self.bounds(u0)
-        gradient, lagrangian, g = (part.full().ravel() for part in self._lagrangian(w, p, multipliers.constraints))
-        free = low < high
-        bound = np.where(free, multipliers.bounds, 0.0)
-        above, below = np.maximum(bound, 0.0), np.maximum(-bound, 0.0)
         inequality = np.isneginf(self.constraint_low)
         pressed = multipliers.constraints[inequality]
+        pressing = np.where(inequality, multipliers.constraints, 0.0)
+        lagrangian, g = (part.full().ravel() for part in self._lagrangian(w, p, pressing))
+        bound = np.where(self._is_input, 0.0, multipliers.bounds)
+        above, below = np.maximum(bound, 0.0), np.maximum(-bound, 0.0)
+        slope = self._by_inputs(lagrangian + bound, units) * units.variables / units.cost
+        # Of an input what a step down the gradient moves it within its bounds, whatever their multipliers are.
+        moved = np.abs(np.clip(w - slope * units.variables, low, high) - w) / units.variables
         residuals = [
-            np.abs(lagrangian + bound)[free],
-            above * np.where(np.isfinite(high), np.abs(high - w), 1.0),
-            below * np.where(np.isfinite(low), np.abs(w - low), 1.0),
-            np.maximum(-pressed, 0.0),
-            np.abs(pressed * g[inequality]),
+            np.where(self._is_input, moved, np.abs(slope)),
+            above * np.where(np.isfinite(high), np.abs(high - w), units.variables) / units.cost,
+            below * np.where(np.isfinite(low), np.abs(w - low), units.variables) / units.cost,
+            np.maximum(-pressed, 0.0) * units.constraints[inequality] / units.cost,
+            np.abs(pressed * g[inequality]) / units.cost,
         ]
-        scale = 1.0 + np.abs(gradient).max() + np.abs(multipliers.constraints).max(initial=0.0)
         worst = max(float(residual.max(initial=0.0)) for residual in residuals)
-        return worst / scale if np.isfinite(worst) else np.inf
+        return worst if np.isfinite(worst) else np.inf
+
+    @cached_property
+    def _is_input(self) -> NDArray[np.bool_]:
+        """Which of the variables are inputs."""
+        mpc, n = self.mpc, self.variables.numel()
+        entries = np.arange(n)
+        stage = mpc.nu + mpc.nx
+        return np.asarray((entries % stage < mpc.nu) & (entries < mpc.horizon * stage))
+
+    def _by_inputs(self, gradient: Array, units: Units) -> Array:
+        """A gradient by the variables ``(n,)`` with what the states add to it moved to the inputs."""
+        nu, N = self.mpc.nu, self.mpc.horizon
+        result = gradient.copy()
+        rows = result[: N * (nu + self.mpc.nx)].reshape(N, -1)
+        rows[:, :nu] += np.einsum("kx,kxu->ku", costates(rows[:, nu:], units.A), units.B)
+        rows[:, nu:] = 0.0
+        return result
 
     @cached_property
     def rollout_candidates(self) -> ca.Function:
@@ -235,7 +335,7 @@ class Transcription:
         state, total, weight = carried[: mpc.nx], carried[mpc.nx], carried[mpc.nx + 1]
         stepped = ca.vertcat(
             mpc.dynamics_function(state, u, theta),
-            total + weight * mpc.stage_function(state, u, theta),
+            total + weight * self._stage(state, u, theta),
             weight * mpc.discount,
         )
         horizon = ca.Function("step", [carried, u, theta], [stepped]).mapaccum("rollout", mpc.horizon)
@@ -243,7 +343,7 @@ class Transcription:
         p = ca.MX.sym("theta", mpc.space.size, mpc.horizon + 1)
         path = horizon(ca.vertcat(s, 0, 1), inputs, p[:, : mpc.horizon])
         last = path[:, -1]
-        cost = last[mpc.nx] + last[mpc.nx + 1] * mpc.terminal_function(last[: mpc.nx], p[:, mpc.horizon])
+        cost = last[mpc.nx] + last[mpc.nx + 1] * self._terminal(last[: mpc.nx], p[:, mpc.horizon])
         one = ca.Function("one", [s, inputs, p], [path[: mpc.nx, :], cost])
         return one.map("all", "serial", N_CANDIDATES, [0, 2], [])
 
@@ -256,3 +356,14 @@ def _price(soft: list[tuple[ca.SX, Penalty, int]], slacks: ca.SX, discount: floa
         cost += discount**k * (penalty.l1 * ca.sum1(s) + penalty.l2 * ca.sumsqr(s))
         start += h.numel()
     return cost
+
+
+def _cost_functions(mpc: MPC) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Stage and terminal cost without constants, ``(x, u, theta)`` and ``(x, theta)``; those of theta, as a pair."""
+    x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
+    costs = costs_of(mpc, x, u, theta)
+    return (
+        ca.Function("stage", [x, u, theta], [costs.stage]),
+        ca.Function("terminal", [x, theta], [costs.terminal]),
+        ca.Function("constants", [theta], [costs.offset, costs.last]),
+    )
