@@ -7,17 +7,14 @@ have slopes everywhere.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from mpcoffline.core.types import Array
 
-from .expression_cost import ExpressionCost
 from .expressions import expanded, instructions
 from .problem import MPC
 
@@ -47,7 +44,7 @@ class Corner:
 
 
 def rounded_mpc(mpc: MPC, share: float) -> tuple[MPC, list[Corner]]:
-    """A problem whose model and costs have their corners rounded, and which these are.
+    """A problem whose functions have their corners rounded, its parts as they were, and which corners these are.
 
     Widths are a share of the range that each quantity has over rollouts from the reference state, or from 0, with the
     inputs in turn at their bounds and between: they follow any unit, and depend on the problem alone.
@@ -57,36 +54,18 @@ def rounded_mpc(mpc: MPC, share: float) -> tuple[MPC, list[Corner]]:
         share: Of the range.
     """
     states, inputs = _visited(mpc)
-    theta = mpc.theta
     corners: list[Corner] = []
-    changes: dict[str, Any] = {}
-    own = mpc.model.space.theta
-    function, found = rounded(mpc.model.function, [states, inputs, own], share)
-    if found:
-        corners += found
-        changes["model"] = copy.copy(mpc.model)
-        changes["model"].function = function
-    for name, whole, variables in (
-        ("stage_cost", mpc.stage_function, [states, inputs]),
-        ("terminal_cost", mpc.terminal_function, [states]),
+    changed = mpc.replace()
+    for name, variables in (
+        ("dynamics_function", [states, inputs]),
+        ("stage_function", [states, inputs]),
+        ("terminal_function", [states]),
     ):
-        function, found = rounded(whole, [*variables, theta], share)
+        function, found = rounded(getattr(mpc, name), [*variables, mpc.theta], share)
         if found:
             corners += found
-            changes[name] = _as_cost(mpc, name, function)
-    return (mpc.replace(**changes) if changes else mpc), corners
-
-
-def _as_cost(mpc: MPC, name: str, function: ca.Function) -> ExpressionCost:
-    """A function of x, (u) and the whole theta as the cost of that name."""
-    cost: Any = getattr(mpc, name)
-    names = [block.name for block in mpc.space]
-    own = [k for k, block_name in enumerate(names) if block_name.startswith(f"{name}.")]
-    start = sum(block.size for block in list(mpc.space)[: own[0]]) if own else 0
-    p, theta = ca.SX.sym("p", cost.space.size), ca.SX(mpc.theta)
-    theta[start : start + cost.space.size] = p
-    variables = [ca.SX.sym(f"i{i}", function.numel_in(i)) for i in range(function.n_in() - 1)]
-    return ExpressionCost(ca.Function("cost", [*variables, p], [function(*variables, theta)]), cost.space, convex=False)
+            changed.__dict__[name] = function  # where the problem keeps what it has derived of its parts
+    return changed, corners
 
 
 def _visited(mpc: MPC) -> tuple[Array, Array]:
@@ -96,7 +75,10 @@ def _visited(mpc: MPC) -> tuple[Array, Array]:
     low, high = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2)), np.where(np.isfinite(high), high, 1.0)
     high = np.maximum(high, low + 1e-12 * (1 + np.abs(low)))
     share = np.clip(rng.uniform(-0.5, 1.5, (mpc.nu, 64)), 0.0, 1.0)
-    x = np.repeat((np.zeros(mpc.nx) if mpc.reference is None else mpc.reference)[:, None], share.shape[1], axis=1)
+    start = np.zeros(mpc.nx)  # past inputs, if it has any, are behind the states that a reference is for
+    if mpc.reference is not None:
+        start[: mpc.reference.size] = mpc.reference
+    x = np.repeat(start[:, None], share.shape[1], axis=1)
     states, inputs = [], []
     for k in range(min(mpc.horizon, 50)):
         if k % 5 == 4:
@@ -104,7 +86,7 @@ def _visited(mpc: MPC) -> tuple[Array, Array]:
         u = low[:, None] + (high - low)[:, None] * share
         states.append(x)
         inputs.append(u)
-        x = mpc.model.function(x, u, mpc.model.space.theta).full()
+        x = mpc.dynamics_function(x, u, mpc.theta).full()
     visited, applied = np.hstack(states), np.hstack(inputs)
     finite = np.isfinite(visited).all(axis=0)
     return visited[:, finite], applied[:, finite]

@@ -63,7 +63,14 @@ def temperature() -> MPC:
     return MPC(Model(heated, 3, 1, 5.0, discrete=True), cost, end, 20, 0.99, [0.0], [100.0])
 
 
+def delayed() -> MPC:
+    cost = QuadraticCost(np.eye(1), [[1e-6]], x_ref=[1.0], u_ref=[10.0])
+    model = Model(tank, 1, 1, 0.5, delay=2)
+    return MPC(model, cost, QuadraticCost(np.eye(1), x_ref=[1.0]), 12, 0.98, [0.0], [100.0])
+
+
 CASES = {
+    "delayed tank": (delayed, [0.0, 0.0, 0.0], [8.0, 100.0, 100.0]),
     "tank": (level, [0.0], [8.0]),
     "heated": (temperature, [20.0, 20.0, 0.0], [70.0, 75.0, 100.0]),
     "dead zone": (lambda: servo(dead_zone), [-2.0, -2.0], [2.0, 2.0]),
