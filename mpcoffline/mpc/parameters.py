@@ -368,11 +368,8 @@ def psd_factor(matrix: Array, name: str = "matrix") -> Array:
     asymmetry = np.abs(scaled - scaled.T)
     if asymmetry.max(initial=0.0) > _PSD_TOLERANCE:
         i, j = np.unravel_index(int(asymmetry.argmax()), asymmetry.shape)
-        raise InvalidArgumentError(
-            name,
-            expected="a symmetric matrix",
-            actual=f"entries that differ from their mirror by {abs(matrix[i, j] - matrix[j, i]):.3g}",
-        )
+        differ = f"entries that differ from their mirror by {abs(matrix[i, j] - matrix[j, i]):.3g}"
+        raise InvalidArgumentError(name, expected="a symmetric matrix", actual=differ)
     if np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -_PSD_TOLERANCE:
         smallest = np.linalg.eigvalsh((matrix + matrix.T) / 2.0)[0]
         raise InvalidArgumentError(
