@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -21,7 +20,7 @@ from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfa
 from .integrators import Scheme, exact_scheme, integrated, is_short
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
-from .signals import Signal
+from .signals import Signal, takes_signals
 from .substeps import Choice, Flow, choice_from, choice_on
 from .torch_import import TorchExpression
 
@@ -226,7 +225,7 @@ class Model(Component):
         """What the user wrote as SX function (x, [u, d], p), p being this model's flat parameter vector."""
         x, u = ca.SX.sym("x", self.layout.n_states), ca.SX.sym("u", len(self.layout.acting))
         theta = ca.SX.sym("p", self.space.size)
-        outside = [self.layout.named(u[self.nu :])] if _takes_signals(dynamics) else []
+        outside = [self.layout.named(u[self.nu :])] if takes_signals(dynamics) else []
         try:
             value = ca.densify(ca.SX(dynamics(x, u[: self.nu], self.space.symbols(theta), *outside)))
             if value.shape != (self.layout.n_states, 1):
@@ -388,13 +387,3 @@ class Model(Component):
         model.layout = layout
         model._take(function, integrator, scheme, settled=data["settled"] is True)
         return model
-
-
-def _takes_signals(dynamics: Callable[..., Any]) -> bool:
-    """Whether a function of the user takes signals as its fourth argument."""
-    try:
-        parameters = inspect.signature(dynamics).parameters.values()
-    except (TypeError, ValueError):  # of what is built in
-        return False
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters) >= 4

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import keyword
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -98,3 +99,13 @@ class Named:
         if name.startswith("_"):
             raise AttributeError(name)
         return self[name]
+
+
+def takes_signals(dynamics: Callable[..., Any]) -> bool:
+    """Whether a function of the user takes signals as its fourth argument."""
+    try:
+        parameters = inspect.signature(dynamics).parameters.values()
+    except (TypeError, ValueError):  # of what is built in
+        return False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters) >= 4
