@@ -16,6 +16,8 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.types import Array
 
+from .expressions import is_affine
+
 #: The most substeps of RK4: with more, a solver's code takes minutes to compile.
 MOST_SUBSTEPS = 64
 _MOST_HALVINGS = 60
@@ -135,6 +137,24 @@ def exact_scheme(ode: ca.Function, dt: float, theta: Array, given: Scheme | None
     if given is not None and given.substeps >= 1 << needed:
         return given
     return Scheme("exact", 1 << (needed + _MARGIN))
+
+
+def first_scheme(ode: ca.Function, dt: float, theta: Array, asked: Scheme | None) -> Scheme:
+    """The scheme asked for, else the exponential of an affine ODE, else one RK4 step until more is known.
+
+    Raises:
+        InvalidArgumentError: If the exponential is asked for of an ODE that is not affine.
+    """
+    if asked is not None and asked.kind == "rk4":
+        return asked
+    if is_affine(ode):
+        exact = exact_scheme(ode, dt, theta)
+        if asked is not None or is_short(ode, exact):
+            return exact
+    elif asked is not None:
+        expected = "'auto' or 'rk4:N' for dynamics that are not affine in (x, u)"
+        raise InvalidArgumentError("integrator", expected=expected, actual=repr(asked.kind))
+    return Scheme("rk4")
 
 
 def is_short(ode: ca.Function, scheme: Scheme) -> bool:

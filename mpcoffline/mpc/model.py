@@ -17,7 +17,7 @@ from mpcoffline.core.types import Array
 from .component import Component, blocks_from_json
 from .expressions import function_from_json, function_to_json, is_affine, traced
 from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfall
-from .integrators import Scheme, exact_scheme, integrated, is_short
+from .integrators import Scheme, exact_scheme, first_scheme, integrated
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
 from .signals import Signal, takes_signals
@@ -100,7 +100,12 @@ class Model(Component):
             self._take(function, "map", None)
         else:
             asked = None if integrator == "auto" else Scheme.of(integrator)
-            self._take(function, integrator, self._first_scheme(function, asked), settled=asked is not None)
+            self._take(
+                function,
+                integrator,
+                first_scheme(function, self.dt, self.space.theta, asked),
+                settled=asked is not None,
+            )
 
     @classmethod
     def from_torch(
@@ -207,19 +212,6 @@ class Model(Component):
         other, reached = copy.copy(self), self.plant(x, u, theta) + addition(x, u)
         other._take(ca.Function("dynamics", [x, u, theta], [reached]), "map", None)
         return other
-
-    def _first_scheme(self, ode: ca.Function, asked: Scheme | None) -> Scheme:
-        """The scheme asked for, else the exponential of an affine ODE, else one RK4 step until more is known."""
-        if asked is not None and asked.kind == "rk4":
-            return asked
-        if is_affine(ode):
-            exact = exact_scheme(ode, self.dt, self.space.theta)
-            if asked is not None or is_short(ode, exact):
-                return exact
-        elif asked is not None:
-            expected = "'auto' or 'rk4:N' for dynamics that are not affine in (x, u)"
-            raise InvalidArgumentError("integrator", expected=expected, actual=repr(asked.kind))
-        return Scheme("rk4")
 
     def _traced(self, dynamics: Dynamics) -> ca.Function:
         """What the user wrote as SX function (x, [u, d], p), p being this model's flat parameter vector."""
