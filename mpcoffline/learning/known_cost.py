@@ -104,7 +104,7 @@ def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True) -> Known
         The relation; None where there is none.
     """
     ours, logged, inputs, pairs = _costs(mpc, table)
-    if len(logged) and np.ptp(logged) <= 1e-6 * np.abs(logged).max():
+    if len(logged) and np.ptp(logged) <= 1e-12 * np.abs(logged).max():
         return KnownCost(offset=float(logged.mean()), constant=True)
     if len(logged) < 3 or not np.isfinite(ours).all() or not ours.std() > 0.0:
         return None
