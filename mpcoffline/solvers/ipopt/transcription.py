@@ -211,11 +211,10 @@ class Transcription:
 
     def reference(self, p: Array) -> list[Array]:
         """The state that the costs pull to, by the theta in p: none, or ``(nx,)`` for each theta."""
-        thetas = p[self.mpc.nx :].reshape(-1, self.mpc.space.size)
         for name in ("stage_cost.x_ref", "terminal_cost.x_ref"):
             part = self.mpc.space.slices.get(name)
             if part is not None and part.stop - part.start == self.mpc.nx:
-                return list(thetas[:, part])
+                return list(p[self.mpc.nx :].reshape(-1, self.mpc.space.size)[:, part])
         return []
 
     def expansion(self, w: Array, p: Array) -> Expansion:
