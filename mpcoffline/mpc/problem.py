@@ -299,8 +299,8 @@ class MPC:
 
     @property
     def state_bounds(self) -> list[StateBounds]:
-        """The bounds of x_1 ... x_N, on z; past inputs have none."""
-        return [c.padded(self.nx - self.ny) for c in self._constraints if isinstance(c, StateBounds)]
+        """The bounds of x_1 ... x_N, on z; what they are not of has none."""
+        return [c.padded(self.nx - np.size(c.low)) for c in self._constraints if isinstance(c, StateBounds)]
 
     @property
     def _constraints(self) -> tuple[Constraint | StateBounds, ...]:
@@ -365,7 +365,7 @@ class MPC:
 
 
 def _sizes(model: Model) -> Sizes:
-    return Sizes(model.ny, model.nu, model.space)
+    return Sizes(model.ny, model.nu, model.space, model.layout.n_states)
 
 
 def _discount(value: object) -> float:

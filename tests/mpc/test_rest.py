@@ -9,6 +9,7 @@ import numpy as np
 
 from mpcoffline import MPC, Model, QuadraticCost, Signal
 from mpcoffline.mpc.rest import at_rest
+from mpcoffline.mpc.seen import sees_memory
 from mpcoffline.plotting import stage_weights
 from mpcoffline.solvers.scaling import input_units
 
@@ -45,3 +46,12 @@ def test_weights_are_those_of_states_signals_and_inputs() -> None:
     expected[0, 0], expected[5, 5] = 0.1, 0.25
     expected[np.ix_([1, 2], [1, 2])] = [[1.0, -1.0], [-1.0, 1.0]]
     np.testing.assert_allclose(stage_weights(followed(5.0)), expected, atol=1e-12)
+
+
+def test_a_stage_cost_sees_past_inputs_where_changes_have_a_price_whatever_the_delay() -> None:
+    for delay in (0, 2):
+        model = Model(lambda x, u, p: x + u, 1, 1, 1.0, discrete=True, delay=delay)
+        plain, priced = QuadraticCost([[1.0]], [[0.1]]), QuadraticCost([[1.0]], [[0.1]], D=[[0.2]])
+        for cost, seen in ((plain, False), (priced, True)):
+            mpc = MPC(model, cost, QuadraticCost([[1.0]]), 5, 0.9, [-1.0], [1.0])
+            assert sees_memory(mpc.layout, mpc.stage_cost) is seen
