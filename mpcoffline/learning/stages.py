@@ -72,6 +72,7 @@ class KnownCost:
         offset: In the unit of the logged costs.
         missed: Share of the variance of the logged costs that is not explained.
         agreeing: Share of the transitions that it holds for.
+        tolerance: Where that is not all: up to this, in the unit of the logged costs, it holds for one.
         constant: Whether all logged costs are one number, so that they say nothing about Lhat.
     """
 
@@ -79,6 +80,7 @@ class KnownCost:
     offset: float = 0.0
     missed: float = 0.0
     agreeing: float = 1.0
+    tolerance: float = 0.0
     constant: bool = False
 
     def __str__(self) -> str:
