@@ -96,7 +96,7 @@ def identified(known: Known, config: StartConfig) -> Known:
 
 def completed(known: Known) -> Known:
     """The identified model with a learned residual, where held-out episodes ask for one."""
-    residual = fit_residual(known.mpc, known.table, known.seed)
+    residual = fit_residual(known.mpc, as_logged(known.mpc, known.table, known.cost), known.seed)
     _log.info("%s", residual)
     if not residual.taken:
         return known
