@@ -14,6 +14,7 @@ from mpcoffline.core.outputs import check_output_folder, write_file
 from mpcoffline.core.text import c_comment, c_identifiers
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.rest import at_rest
 from mpcoffline.solvers import DDPSolver, starts
 from mpcoffline.solvers.ddp.codegen import generated, text
 from mpcoffline.solvers.scaling import input_units
@@ -122,7 +123,7 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
         _array("candidates", segments),
         "/* What counts as applied before the first step; where each past input comes from: past inputs, then u. */",
         _array("usual", np.append(mpc.layout.filled(mpc.usual_input), 0.0)),
-        f"static const int sources[] = {{{', '.join(map(str, [*(mpc.layout.sources - mpc.ny), 0]))}}};",
+        f"static const int sources[] = {{{', '.join(map(str, [*mpc.layout.memory_sources, 0]))}}};",
         "const mpc_parameters mpc_learned_parameters = {\n" + "\n".join(values) + "\n};",
         "/* mpc_parameters is nothing but MPC_NP numbers: the size of this array is negative if it were not. */",
         "typedef char mpc_parameters_are_numbers[sizeof(mpc_parameters) == MPC_NP * sizeof(double) ? 1 : -1];",
@@ -188,18 +189,23 @@ def _unambiguous_starts(policy: MPCPolicy) -> list[Array]:
 
 
 def _reached(mpc: MPC) -> tuple[Array, Array, Array]:
-    """The reference (zero without one), and between which states the starts are: where the inputs take the model.
+    """Where the plant rests, and between which observations the starts are: where the inputs take the model.
 
     That is the middle half of what an episode reaches from there, widened to twice its size; so it is in the plant's
-    own units.
+    own units. A signal that a state tracks goes as far as that, another as far as its own size, 1 where that is zero.
     """
-    inputs, centre = starts.candidate_inputs(mpc), np.zeros(mpc.ny) if mpc.reference is None else mpc.reference
-    states = [mpc.state(np.broadcast_to(centre, (len(inputs), mpc.ny)))]
+    inputs, rest = starts.candidate_inputs(mpc), at_rest(mpc)
+    states = [np.tile(rest, (len(inputs), 1))]
     for k in range(min(_STEPS, mpc.horizon)):
         states.append(mpc.model(states[-1], inputs[:, k]))
     reached = np.concatenate(states)[:, : mpc.ny]
     low, high = np.quantile(reached[np.isfinite(reached).all(axis=1)], [0.25, 0.75], axis=0)
-    return centre, low - (high - low) / 2, high + (high - low) / 2
+    tracks = {name: i for i, name in (getattr(mpc.stage_cost, "tracks", None) or {}).items()}
+    for signal, first in zip(mpc.layout.signals, mpc.layout.present, strict=True):
+        state, size, part = tracks.get(signal.name), abs(signal.usual) or 1.0, slice(first, first + signal.size)
+        away = (-size, size) if state is None else (low[state] - rest[state], high[state] - rest[state])
+        low[part], high[part] = signal.usual + away[0], signal.usual + away[1]
+    return rest[: mpc.ny], low - (high - low) / 2, high + (high - low) / 2
 
 
 def _number(value: float) -> str:

@@ -17,6 +17,7 @@ from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.seen import sees_memory
 from mpcoffline.simulation.closed_loop import Simulation, initial_rows, signals_along, simulate
 from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
@@ -94,7 +95,7 @@ def diagnose(
     found = identify(nominal, table, seed=seed)
     clean, identified = found.table, nominal.replace(model=found.model)
     ensemble = Ensemble(identified, clean, found, seed=seed)
-    seen = None if learned.layout.has_previous else learned.ny
+    seen = None if sees_memory(learned.layout, learned.stage_cost) else learned.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
     rows = initial_rows(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)

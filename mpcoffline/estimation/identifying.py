@@ -114,12 +114,11 @@ def identify(
         check_integers(1, horizon=horizon)
     whole = state_rows(mpc, table)
     rows = plant_rows(mpc, whole)
-    mpc = mpc.replace(
-        model=mpc.model.suited_to_log(rows, finer=True)
-    )  # rows may have been left out since it was chosen
+    # Rows may have been left out since it was chosen.
+    mpc = mpc.replace(model=mpc.model.suited_to_log(whole, finer=True))
     for _ in range(_ROUNDS):
         found = _identified(mpc, rows, config, horizon, seed)
-        model = found.model.suited_to_log(rows, finer=True)
+        model = found.model.suited_to_log(whole, finer=True)
         if model.scheme == found.model.scheme:
             break
         logger.info("Identified again: at what was found, %s is not accurate, %s is.", found.model.scheme, model.scheme)

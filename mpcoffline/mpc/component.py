@@ -73,8 +73,7 @@ class StageCost(Protocol):
     (``d.price``), ``terminal_expression`` too.
 
     The state x is the observation ``(ny, 1)``; where the cost has an attribute ``nx`` that is the number of the plant's
-    states, it is these, and where the cost has an attribute ``nx`` that is the size of the whole
-    state of the MPC, past inputs included, it is that.
+    states, it is these, and where that is the size of the whole state of the MPC, past inputs included, it is that.
     """
 
     space: ParameterSpace

@@ -38,11 +38,19 @@ class Penalty(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """What a constraint must fit: numbers of states and inputs, and the parameters of the model."""
+    """What a constraint must fit: numbers of states and inputs, and the parameters of the model.
+
+    Attributes:
+        nx: Size of the observation: the plant's states and signals.
+        nu: Number of inputs.
+        parameters: Those of the model.
+        n_states: Number of the plant's states.
+    """
 
     nx: int
     nu: int
     parameters: ParameterSpace
+    n_states: int
 
 
 class AnyConstraint(ABC):
@@ -148,7 +156,7 @@ class StateBounds(AnyConstraint):
     """Bounds low <= x_k <= high for k = 1 ... N; the initial state is given, so it is not asked.
 
     Args:
-        low: Lower bounds, ``(nx,)``; ``-inf`` where there are none.
+        low: Lower bounds of the observation, or of the plant's states alone, ``(nx,)``; ``-inf`` where there are none.
         high: Upper bounds, ``(nx,)``.
         name: What it is called in a solution's status.
         soft: None for hard bounds, else the price of violating them.
@@ -172,14 +180,15 @@ class StateBounds(AnyConstraint):
         object.__setattr__(self, "high", high)
 
     def fitted(self, sizes: Sizes) -> StateBounds:
-        """The bounds, if they are as many as states.
+        """The bounds, if they are as many as the plant's states, or with signals.
 
         Raises:
             InvalidArgumentError: If they are not.
         """
-        if np.shape(self.low) != (sizes.nx,):
+        if np.size(self.low) not in (sizes.n_states, sizes.nx):
+            more = f", or {sizes.nx} with signals" if sizes.nx > sizes.n_states else ""
             raise InvalidArgumentError(
-                self.name, expected=f"{sizes.nx} numbers, one a state", actual=f"shape {np.shape(self.low)}"
+                self.name, expected=f"{sizes.n_states} numbers, one a state{more}", actual=f"shape {np.shape(self.low)}"
             )
         return self
 

@@ -17,6 +17,7 @@ from mpcoffline.core.types import Array
 
 from .expressions import expanded, instructions
 from .problem import MPC
+from .rest import at_rest
 
 _COMPARED = {ca.OP_FMAX: "fmax", ca.OP_FMIN: "fmin", ca.OP_LT: "if_else", ca.OP_LE: "if_else"}
 _OF_ONE = {ca.OP_FABS: "fabs", ca.OP_SIGN: "sign", ca.OP_SQRT: "sqrt", ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow"}
@@ -75,10 +76,7 @@ def _visited(mpc: MPC) -> tuple[Array, Array]:
     low, high = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2)), np.where(np.isfinite(high), high, 1.0)
     high = np.maximum(high, low + 1e-12 * (1 + np.abs(low)))
     share = np.clip(rng.uniform(-0.5, 1.5, (mpc.nu, 64)), 0.0, 1.0)
-    start = np.zeros(mpc.nx)  # past inputs, if it has any, are behind the states that a reference is for
-    if mpc.reference is not None:
-        start[: mpc.reference.size] = mpc.reference
-    x = np.repeat(start[:, None], share.shape[1], axis=1)
+    x = np.repeat(at_rest(mpc)[:, None], share.shape[1], axis=1)
     states, inputs = [], []
     for k in range(min(mpc.horizon, 50)):
         if k % 5 == 4:

@@ -86,7 +86,7 @@ class QuadraticCost(Component):
         if offset.ndim > 0:
             raise InvalidArgumentError("constant", expected="one number", actual=f"shape {offset.shape}")
         blocks.append(Block.free("constant", offset, "cost"))
-        self.nx, self.nu, self.tracks = nx, nu, _checked_tracks(tracks or {}, nx)
+        self.nx, self.nu, self.tracks = nx, nu, checked_tracks(tracks or {}, nx)
         self.space = ParameterSpace(blocks)
 
     @property
@@ -178,7 +178,7 @@ class QuadraticCost(Component):
         values = cost.values
         cost.nx = len(values["x_ref"])
         cost.nu = len(values["u_ref"]) if "u_ref" in values else 0
-        cost.tracks = _checked_tracks(dict(data["tracks"]), cost.nx)
+        cost.tracks = checked_tracks(dict(data["tracks"]), cost.nx)
         return cost
 
 
@@ -226,7 +226,12 @@ class NormCost(Component):
         return cost
 
 
-def _checked_tracks(tracks: Mapping[int, str], nx: int) -> dict[int, str]:
+def checked_tracks(tracks: Mapping[int, str], nx: int) -> dict[int, str]:
+    """Which of nx states follow which signals.
+
+    Raises:
+        InvalidArgumentError: For what is no state, or no name.
+    """
     for i, name in tracks.items():
         if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < nx or not isinstance(name, str):
             raise InvalidArgumentError("tracks", expected=f"names of signals by state, 0 to {nx - 1}", actual=f"{i!r}")

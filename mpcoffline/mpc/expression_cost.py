@@ -24,7 +24,8 @@ class ExpressionCost(Component):
     """A stage cost (x, u, theta) -> L, or a terminal one (x, theta) -> T, as a CasADi function.
 
     Args:
-        function: Of x ``(nx, 1)``, for a stage cost u ``(nu, 1)``, and the flat parameters ``(size, 1)``; a scalar.
+        function: Of x ``(nx, 1)``, for a stage cost u ``(nu, 1)`` and, with a price on their changes, those of the step
+            before ``(nu, 1)``, and the flat parameters ``(size, 1)``; a scalar.
         space: The parameters.
         convex: What the class of the cost promised, see :class:`StageCost`.
 
@@ -34,15 +35,15 @@ class ExpressionCost(Component):
 
     def __init__(self, function: ca.Function, space: ParameterSpace, *, convex: bool = False) -> None:
         self.function, self.space, self.convex = traced("cost", function), space, convex
-        self.nx = self.function.numel_in(0)
+        self.nx, self.uses_previous = self.function.numel_in(0), self.function.n_in() == 4
 
-    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX], *previous: ca.SX) -> ca.SX:
         """The stage cost as a CasADi scalar.
 
         Raises:
             InvalidArgumentError: For other sizes than the function's, which CasADi would stretch.
         """
-        return self._called([x, u], p)
+        return self._called([x, u, *previous], p)
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """The terminal cost as a CasADi scalar; raises as :meth:`expression`."""
@@ -63,7 +64,7 @@ class ExpressionCost(Component):
     def from_json(cls, data: Mapping[str, Any]) -> ExpressionCost:
         """The inverse of ``to_json``."""
         space, sizes = blocks_from_json(data), data["function"]["inputs"]
-        most = (limits.STATES, limits.INPUTS)[: len(sizes) - 1]
+        most = (limits.STATES, limits.INPUTS, limits.INPUTS)[: len(sizes) - 1]
         for size, limit in zip(sizes, (*most, space.size), strict=True):
             check_integers(0, size=size)
             check_limit("cost", "inputs", size, limit)
@@ -90,10 +91,14 @@ def cost_to_json(
     own: Any = cost
     if name := COSTS.name_of(type(cost), shared=portable):
         return dict(own.to_json()) | {"kind": name}
-    z, u, theta = ca.SX.sym("x", layout.nx), ca.SX.sym("u", layout.nu), ca.SX.sym("theta", cost.space.size)
-    p = cost.space.symbols(theta)
+    u, before, theta = ca.SX.sym("u", layout.nu), ca.SX.sym("before", layout.nu), ca.SX.sym("theta", cost.space.size)
+    # Of the observation alone where the cost is, so that it fits another dead time, too.
+    x = ca.SX.sym("x", layout.nx if getattr(cost, "nx", None) == layout.nx else layout.ny)
+    past = [before[int(i)] if age == 1 else ca.SX(0) for i, age in zip(*layout.ages, strict=True)]
+    z, p = ca.vertcat(x, *past)[: layout.nx], cost.space.symbols(theta)
     value = stage_expression(layout, own, z, u, p) if stage else terminal_expression(layout, own, z, p)
-    function = ca.Function("cost", [z, u, theta] if stage else [z, theta], [ca.densify(value)])
+    inputs = [x, u, *([before] if getattr(cost, "uses_previous", False) else [])] if stage else [x]
+    function = ca.Function("cost", [*inputs, theta], [ca.densify(value)])
     return ExpressionCost(function, cost.space, convex=bool(getattr(cost, "convex", False))).to_json()
 
 

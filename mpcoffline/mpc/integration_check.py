@@ -98,14 +98,18 @@ def checked(
 
 
 def sampled(rows: Rows, layout: Layout) -> tuple[Array, Array, Array]:
-    """The plant's states, inputs with present signals beside them, and the states after them of some of the rows.
+    """The plant's states, what acts on them, and the states after them of some of the rows.
 
-    Inputs that act late are taken as they are: they come from the same range.
+    Args:
+        rows: Observations or the MPC's states. Of observations inputs are taken as they are, also those that act late:
+            they come from the same range.
+        layout: What the columns are.
     """
     few = rows.sample(ROWS, 0)
     x, u, reached = (np.asarray(v, np.float64) for v in (few.observations, few.actions, few.next_observations))
-    n = layout.n_states
-    return x[:, :n], np.hstack([u, x[:, layout.present]]), reached[:, :n]
+    n, whole = layout.n_states, x.shape[1] == layout.nx
+    start, acting = layout.split(x, u) if whole else (x[:, :n], np.hstack([u, x[:, layout.present]]))
+    return start, acting, reached[:, :n]
 
 
 def _advice(choice: Choice, scheme: Scheme, *, fixed: bool) -> str:

@@ -177,6 +177,11 @@ class Layout:
         past = [self._place(i, age - 1) for i, age in zip(*self.ages, strict=True)]
         return np.array([*shown, *past], dtype=np.intp)
 
+    @cached_property
+    def memory_sources(self) -> NDArray[np.intp]:
+        """Where in [memory, u] the next value of each entry of the memory stands, ``(n_memory,)``."""
+        return self.sources[self.ny - self.n_states :] - self.ny
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of the memory, as ``"u0[k-2]"``."""
@@ -203,7 +208,7 @@ class Layout:
     def remembered(self, memory: Array, u: Array) -> Array:
         """The memory ``(..., n_memory)`` after inputs u ``(..., nu)`` were applied."""
         every = np.concatenate([memory, u], axis=-1)
-        return every[..., self.sources[len(self.sources) - self.n_memory :] - self.ny]
+        return every[..., self.memory_sources]
 
     def filled(self, past: ArrayLike) -> Array:
         """The memory ``(..., n_memory)`` where each input has been ``past`` ``(..., nu)`` for long."""

@@ -16,7 +16,7 @@ from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import InvalidArgumentError
 
 from .component import COSTS, vector
-from .cost import QuadraticCost
+from .cost import QuadraticCost, checked_tracks
 from .expressions import function_from_json, function_to_json, traced
 from .parameters import Block, ParameterSpace
 
@@ -46,6 +46,7 @@ class LiftedCost(QuadraticCost):
         u_ref: Input reference, ``(nu,)``; zero by default.
         constant: The offset theta_3 of (COST).
         D: Weight of changes of the inputs, ``(nu, nu)``, as in :class:`QuadraticCost`; needs ``R``.
+        tracks: Which states follow which signals, likewise: x above is then the state with its distance there.
 
     Raises:
         InvalidArgumentError: If shapes do not fit, the weights are not symmetric positive semidefinite, or CasADi
@@ -64,10 +65,12 @@ class LiftedCost(QuadraticCost):
         u_ref: ArrayLike | None = None,
         constant: float = 0.0,
         D: ArrayLike | None = None,
+        tracks: Mapping[int, str] | None = None,
     ) -> None:
         super().__init__(W, R, S, u_ref=u_ref, constant=constant, D=D)
         n_features = self.nx
         self.nx = np.size(np.asarray(x_ref))
+        self.tracks = checked_tracks(tracks or {}, self.nx)
         reference = Block.free("x_ref", vector("x_ref", x_ref, self.nx), "reference")
         self.space = ParameterSpace([reference if block.name == "x_ref" else block for block in self.space])
         self.features = _traced(features, self.nx)
@@ -97,7 +100,8 @@ class LiftedCost(QuadraticCost):
         W = scipy.linalg.block_diag(cost.W, np.zeros((more, more)))
         S = np.vstack([cost.S, np.zeros((more, nu))]) if "H" in values else None
         R, u_ref = (cost.R, values["u_ref"]) if nu else (None, None)
-        return cls(features, values["x_ref"], W, R, S, u_ref, float(values["constant"]), values.get("D"))
+        constant = float(values["constant"])
+        return cls(features, values["x_ref"], W, R, S, u_ref, constant, values.get("D"), cost.tracks)
 
     def _error(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """What W weighs: e = phi(x) - phi(x_ref)."""

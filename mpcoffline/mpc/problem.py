@@ -33,6 +33,7 @@ from .expressions import scalar, traced
 from .layout import Layout
 from .model import Model
 from .parameters import Group, ParameterSpace
+from .rest import at_rest, extreme_inputs
 from .seen import stage_expression, terminal_expression
 
 
@@ -94,9 +95,9 @@ class MPC:
         object.__setattr__(self, "action_high", high)
         object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
         _ = self.stage_function, self.terminal_function  # dimensions are refused here, not at the first solve
-        inputs, usual = self._extreme_inputs(), self.layout.usual_signals[self.layout.present - self.layout.n_states]
-        inputs = np.hstack([inputs, np.tile(usual, (len(inputs), 1))])
-        object.__setattr__(self, "model", self.model.suited_to(self._rest()[: self.layout.n_states], inputs))
+        rest, inputs = at_rest(self), extreme_inputs(self)
+        inputs = np.hstack([inputs, np.tile(rest[self.layout.present], (len(inputs), 1))])
+        object.__setattr__(self, "model", self.model.suited_to(rest[: self.layout.n_states], inputs))
 
     def _bounds(self, name: str) -> Array:
         bounds = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))
@@ -169,25 +170,6 @@ class MPC:
             if name in values and values[name].shape in ((n,), (self.ny,), (self.nx,)):
                 return values[name][:n]
         return None
-
-    def _rest(self) -> Array:
-        """The reference; zero where there is none."""
-        return np.zeros(self.layout.n_states) if self.reference is None else self.reference
-
-    def _extreme_inputs(self) -> Array:
-        """The input at rest, and with one input after another on its bounds, ``(1 + 2 nu, nu)``.
-
-        One without bounds is moved by its own size, by 1 where that is zero.
-        """
-        low, high = np.asarray(self.action_low), np.asarray(self.action_high)
-        rest = self.values.get("stage_cost.u_ref", np.zeros(0))
-        with np.errstate(invalid="ignore"):
-            middle = np.nan_to_num((low + high) / 2.0, posinf=0.0, neginf=0.0)
-        rest = np.clip(rest if rest.shape == (self.nu,) else middle, low, high)
-        size = np.where(rest == 0.0, 1.0, np.abs(rest))
-        ends = np.where(np.isfinite(low), low, rest - size), np.where(np.isfinite(high), high, rest + size)
-        moved = [np.where(np.arange(self.nu) == i, end, rest) for end in ends for i in range(self.nu)]
-        return np.stack([rest, *moved])
 
     @property
     def usual_input(self) -> Array:
@@ -317,8 +299,8 @@ class MPC:
 
     @property
     def state_bounds(self) -> list[StateBounds]:
-        """The bounds of x_1 ... x_N, on z; past inputs have none."""
-        return [c.padded(self.nx - self.ny) for c in self._constraints if isinstance(c, StateBounds)]
+        """The bounds of x_1 ... x_N, on z; what they are not of has none."""
+        return [c.padded(self.nx - np.size(c.low)) for c in self._constraints if isinstance(c, StateBounds)]
 
     @property
     def _constraints(self) -> tuple[Constraint | StateBounds, ...]:
@@ -383,7 +365,7 @@ class MPC:
 
 
 def _sizes(model: Model) -> Sizes:
-    return Sizes(model.ny, model.nu, model.space)
+    return Sizes(model.ny, model.nu, model.space, model.layout.n_states)
 
 
 def _discount(value: object) -> float:

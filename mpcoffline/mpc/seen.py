@@ -22,6 +22,11 @@ def terminal_expression(layout: Layout, cost: Any, z: ca.SX, p: Mapping[str, ca.
     return ca.SX(cost.terminal_expression(_seen_by(layout, cost, z), p, **_outside(layout, cost, z)))
 
 
+def sees_memory(layout: Layout, cost: Any) -> bool:
+    """Whether a stage cost depends on past inputs."""
+    return bool(getattr(cost, "uses_previous", False)) or layout.ny < layout.nx == getattr(cost, "nx", None)
+
+
 def _seen_by(layout: Layout, cost: Any, z: ca.SX) -> ca.SX:
     """The observation in z, or as much of z as the cost's ``nx`` says."""
     size = getattr(cost, "nx", None)

@@ -13,6 +13,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.envs import Plant
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.rest import at_rest
 
 from .panels import on_plane, plane_of, task_of
 from .portrait import draw_levels, label_plane
@@ -83,8 +84,7 @@ def stage_weights(mpc: MPC) -> Array:
     x, u = ca.SX.sym("x", mpc.ny), ca.SX.sym("u", mpc.nu)
     z = ca.vertcat(x, ca.DM(mpc.layout.filled(mpc.usual_input)))
     hessian, _ = ca.hessian(mpc.stage_function(z, u, mpc.theta), ca.vertcat(x, u))
-    values = mpc.values
-    at = [values.get(f"stage_cost.{name}", np.zeros(size)) for name, size in (("x_ref", mpc.ny), ("u_ref", mpc.nu))]
+    at = at_rest(mpc)[: mpc.ny], mpc.values.get("stage_cost.u_ref", np.zeros(mpc.nu))
     return np.asarray(0.5 * ca.Function("H", [x, u], [hessian])(*at).full())
 
 

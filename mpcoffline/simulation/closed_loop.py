@@ -57,7 +57,7 @@ def simulate(
 ) -> Simulation:
     """Runs a controller on all members from all starts; all MPCs of a step are solved in one batch.
 
-    A state that runs away (30 spreads of the data) stays where it was and costs as much as the dearest logged
+    A plant's state that runs away (30 spreads of the data) stays where it was and costs as much as the dearest logged
     transition from then on.
 
     Args:
@@ -74,6 +74,7 @@ def simulate(
     middle, spread = columns.observations.mean(axis=0), columns.observations.std(axis=0)
     reach = np.abs(columns.observations - middle).max(axis=0) + _RUN_AWAY * spread
     reach = np.where(spread > 0.0, reach, np.inf)
+    reach[policy.mpc.layout.n_states :] = np.inf  # inputs have bounds of their own; a log may hardly use them
     dearest = float(columns.costs.max())
     ny, outside = policy.mpc.ny, slice(policy.mpc.layout.n_states, policy.mpc.ny)
     n, (s, nx) = len(ensemble), starts.shape

@@ -10,6 +10,7 @@ import numpy as np
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.rest import at_rest
 
 _DEEPEST = 200  # sums within sums that are looked through for constants
 _WIDE = 1e19  # a bound beyond is none, as for ipopt
@@ -112,9 +113,8 @@ def input_units(mpc: MPC) -> Array:
         return np.ascontiguousarray(width)
     x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
     hessian, _ = ca.hessian(mpc.stage_function(x, u, theta), u)
-    at = np.zeros(mpc.nx) if mpc.reference is None else mpc.reference
     level = np.clip(0.0, mpc.action_low, mpc.action_high)
-    curvature = ca.Function("curvature", [x, u, theta], [ca.densify(ca.diag(hessian))])(at, level, mpc.theta)
+    curvature = ca.Function("curvature", [x, u, theta], [ca.densify(ca.diag(hessian))])(at_rest(mpc), level, mpc.theta)
     diagonal = np.abs(curvature.full().ravel())
     usable = bool(np.isfinite(diagonal).all() and (diagonal > 0.0).all())
     return 1.0 / np.sqrt(diagonal) if usable else np.ones(mpc.nu)

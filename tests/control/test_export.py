@@ -14,7 +14,7 @@ import pytest
 from mpc_problems import random_linear, random_states
 from task_ids import CARTPOLE, LINEAR, PENDULUM
 
-from mpcoffline import MPCPolicy, OfflineMPCLearner
+from mpcoffline import MPCPolicy, OfflineMPCLearner, Signal
 from mpcoffline.control.export import export_c
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, NetworkCost, QuadraticCost
@@ -59,6 +59,20 @@ def mpc_of(case: str) -> MPC:
         reference = [1.0, 0.0, np.sqrt(9.81)]
         cost = QuadraticCost(np.eye(3), [[0.1]], x_ref=reference, u_ref=[2.0 * reference[2]])
         return MPC(model, cost, QuadraticCost(np.eye(3), x_ref=reference), 12, 0.95, [0.0], [12.0])
+    if case in {"signals", "signals, no bounds"}:  # of which a state tracks one that is previewed, and inputs act late
+        signals, tracks = [Signal("set_point", preview=2, usual=0.8), Signal("inflow", usual=0.3)], {1: "set_point"}
+        model = Model(
+            lambda x, u, p, d: ca.vertcat(0.8 * x[0] + 0.2 * ca.tanh(u) + 0.1 * d.inflow, 0.9 * x[1] + 0.1 * x[0]),
+            2,
+            1,
+            0.5,
+            discrete=True,
+            signals=signals,
+            delay=2,
+        )
+        cost = QuadraticCost(np.diag([0.01, 1.0]), [[0.05]], D=[[0.1]], tracks=tracks)
+        high = 2.0 if case == "signals" else np.inf
+        return MPC(model, cost, QuadraticCost(np.diag([0.01, 3.0]), tracks=tracks), 12, 0.95, [-high], [high])
     if case == "three inputs":
         return random_linear(0, nu=3)
     if case == "network":
@@ -85,6 +99,8 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
         "three inputs",
         "network",
         "late inputs",
+        "signals",
+        "signals, no bounds",
         "stiff motor",
         pytest.param("substeps", marks=pytest.mark.slow),
     ],

@@ -5,12 +5,14 @@ from __future__ import annotations
 import lq_plant
 import numpy as np
 import pytest
+from late_plants import belt_mpc
 from lq_episodes import episodes
 from lq_plant import BEST, DISCOUNT, QuadraticValue
 from numpy.typing import NDArray
 
 from mpcoffline import MPCPolicy
 from mpcoffline.datasets import TransitionTable
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.diagnostics.measures import (
     bound_names,
     fit_errors,
@@ -148,6 +150,23 @@ def test_a_state_that_runs_away_is_lost_and_dear() -> None:
     assert not result.success[0, 0]
     assert result.cost[0, 0] > 10 * LOG.costs.max()
     assert np.isfinite(result.cost).all()
+
+
+def test_past_inputs_that_the_log_hardly_varied_are_no_state_that_runs_away() -> None:
+    """The log holds a belt's input near 0.1; the policy needs up to 1, one step late."""
+    mpc, rng, parts = belt_mpc(1, gain=0.5, decay=0.9), np.random.default_rng(0), []
+    for e in range(30):
+        x, before = rng.uniform(0.0, 5.0), 0.1
+        for _ in range(20):
+            u, reached = 0.1 + 0.002 * rng.normal(), 0.9 * x + 0.5 * before + 0.1
+            parts.append(([x], [u], (x - 3.0) ** 2 + 0.02 * u**2, [reached], False, e))
+            x, before = reached, u
+    log = with_memory(TransitionTable.from_arrays(*(np.array(part) for part in zip(*parts, strict=True))), mpc.layout)
+    ensemble = Ensemble(mpc, log, identify_one_step(mpc, log), n_perturbed=0, n_residual=0)
+    result = simulate(MPCPolicy(mpc), ensemble, LoggedCost(log, seen=1), log, np.array([[0.5, 0.1]]), 30)
+    assert result.actions.max() > 0.9
+    assert not result.lost.any()
+    assert result.states[0, -1, 0] == pytest.approx(3.0, abs=0.3)
 
 
 def test_starts_are_those_of_the_log() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import torch
+from scipy.integrate import solve_ivp
 
 from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, Parameter, QuadraticCost, Signal, TransitionTable
 from mpcoffline.datasets.table.memory import with_memory
@@ -57,6 +58,31 @@ def test_the_plants_parameters_are_identified_and_its_dead_time_found() -> None:
     found = identify(make_mpc(2), table)
     np.testing.assert_allclose(found.theta[:3], [0.9, 0.5, 0.3], rtol=0.05)
     assert found.errors_after.shape == (1,)
+
+
+def test_an_ode_that_is_not_affine_is_identified_beside_signals_and_dead_time() -> None:
+    """A drained tank, its rows integrated by scipy; how finely it is integrated is chosen on the log."""
+
+    def ode(x: ca.SX, u: ca.SX, p: dict[str, ca.SX], d: Any) -> ca.SX:
+        return p["gain"] * u + p["share"] * d.inflow - p["drain"] * x * ca.fabs(x)
+
+    parameters = {name: Parameter(0.5, low=0.01, high=5.0) for name in ("gain", "share", "drain")}
+    signals = [Signal("inflow", preview=1)]
+    stiff, cost = Model(ode, 1, 1, 2.0, parameters, delay=1, signals=signals), QuadraticCost([[1.0]], [[0.1]])
+    mpc = MPC(stiff, cost, QuadraticCost([[1.0]]), 5, 0.9, [0.0], [4.0])
+    rng, parts = np.random.default_rng(0), []
+    for e in range(6):
+        x, before, inflow = rng.uniform(0.5, 2.0), 1.0, rng.uniform(0.0, 1.0, 32)
+        for k in range(30):
+            u, rate = rng.uniform(0.0, 4.0), 0.8 * before + 0.3 * inflow[k]
+            reached = solve_ivp(lambda _, x, rate: rate - 1.2 * x * abs(x), (0.0, 2.0), [x], args=(rate,), rtol=1e-9)
+            y = np.array([[x, *inflow[k : k + 2]], [reached.y[0, -1], *inflow[k + 1 : k + 3]]])
+            parts.append((y[0], [u], x**2, y[1], False, e))
+            x, before = y[1, 0], u
+    table = TransitionTable.from_arrays(*(np.array(part) for part in zip(*parts, strict=True)))
+    found = identify(mpc, table)
+    np.testing.assert_allclose(found.theta[:3], [0.8, 0.3, 1.2], rtol=0.03)
+    assert found.model.check(table).advice == found.model.check(with_memory(table, mpc.layout)).advice == ""
 
 
 def test_predicted_successors_have_the_logged_signals() -> None:

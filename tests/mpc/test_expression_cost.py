@@ -13,6 +13,8 @@ import pytest
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.mpc import COSTS, MPC, Block, ExpressionCost, Model, ParameterSpace, QuadraticCost
 from mpcoffline.mpc.component import Component
+from mpcoffline.mpc.seen import sees_memory
+from mpcoffline.mpc.signals import Signal
 
 
 class Huber(Component):
@@ -120,3 +122,35 @@ def test_damaged_functions_are_refused(change: Any) -> None:
     change(document["stage_cost"]["function"])
     with pytest.raises(FileFormatError):
         MPC.from_json(document)
+
+
+class Priced(Component):
+    """(x_1 - d.goal)^2 + (u - u_before)'(u - u_before)."""
+
+    uses_previous = uses_signals = True
+
+    def __init__(self) -> None:
+        self.space = ParameterSpace([])
+
+    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX], *before: ca.SX, d: Any = None) -> ca.SX:
+        return ca.SX((x[1] - d.goal) ** 2 + ca.sumsqr(u - before[0]))
+
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX], *, d: Any = None) -> ca.SX:
+        return ca.SX((x[1] - d.goal) ** 2)
+
+
+@pytest.mark.parametrize("delay", [None, 0, (2, 1)])
+def test_a_cost_that_was_saved_fits_another_dead_time(delay: tuple[int, int] | None) -> None:
+    """As when a learner that was saved before its fit finds one."""
+    model = Model(lambda x, u, p: x + u, 2, 2, 1.0, discrete=True, delay=delay, signals=[Signal("goal", preview=1)])
+    mpc = MPC(model, Priced(), Priced(), 5, 0.9, [-1.0, -1.0], [1.0, 1.0])
+    read = MPC.from_json(json.loads(json.dumps(mpc.to_json())))
+    assert read.layout == mpc.layout
+    assert sees_memory(read.layout, read.stage_cost)
+    for other in (read, read.with_delay((0, 3)), read.with_delay(0)):
+        past = np.arange(1.0, 1.0 + other.layout.n_memory)
+        z, u = other.state([0.1, 0.2, 0.7, 0.9], past), np.array([0.4, -0.3])
+        before = past[[list(other.layout.names).index(name) for name in ("u0[k-1]", "u1[k-1]")]]
+        expected = 0.5**2 + np.sum((u - before) ** 2)
+        assert float(other.stage_function(z, u, other.theta)) == pytest.approx(expected)
+        assert float(other.terminal_function(z, other.theta)) == pytest.approx(0.25)

@@ -12,6 +12,7 @@ from scipy.optimize import linprog
 
 from mpcoffline import MPC, Model, MPCPolicy, Parameter, QuadraticCost, Signal, StateBounds
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.mpc import LiftedCost, polynomial_features
 from mpcoffline.mpc.component import Component
 from mpcoffline.mpc.layout import Layout
 from mpcoffline.mpc.parameters import ParameterSpace
@@ -167,3 +168,32 @@ def test_names_are_checked_where_they_are_used() -> None:
         )
     with pytest.raises(InvalidArgumentError, match="tracks"):
         QuadraticCost([[1.0]], tracks={1: "set_point"})
+
+
+def test_bounds_may_be_of_the_plants_states_alone() -> None:
+    every = StateBounds([-np.inf, -np.inf, -np.inf, -np.inf], [0.4, np.inf, np.inf, np.inf])
+    given = following(preview=2, delay=1)
+    mpcs = [given.replace(constraints=[bounds]) for bounds in (every, StateBounds([-np.inf], [0.4]))]
+    mpcs.append(MPC.from_json(json.loads(json.dumps(mpcs[1].to_json()))))
+    for mpc in mpcs:
+        np.testing.assert_array_equal(mpc.state_bounds[0].high, [0.4, *[np.inf] * 4])
+    plans = [make_solver(mpc, "ipopt").solve(mpc.state([0.0, 1.0, 1.0, 1.0])) for mpc in mpcs[:2]]
+    np.testing.assert_array_equal(plans[0].u, plans[1].u)
+    assert plans[1].x.max(axis=0)[0] == pytest.approx(0.4, abs=1e-6)
+    with pytest.raises(InvalidArgumentError, match="expected 1 numbers, one a state, or 4 with signals"):
+        given.replace(constraints=[StateBounds([0.0, 0.0], [1.0, 1.0])])
+
+
+def test_a_lifted_cost_follows_the_signals_that_its_quadratic_one_does() -> None:
+    quadratic = following()
+    lifted = quadratic.replace(
+        stage_cost=LiftedCost.of(quadratic.stage_cost, polynomial_features(1)),  # type: ignore[arg-type]
+        terminal_cost=LiftedCost.of(quadratic.terminal_cost, polynomial_features(1)),  # type: ignore[arg-type]
+    )
+    for mpc in (lifted, MPC.from_json(json.loads(json.dumps(lifted.to_json())))):
+        for z in ([0.3, 1.0], [-0.5, -2.0]):
+            for found, expected in (
+                (mpc.stage_function(z, [0.2], mpc.theta), (z[0] - z[1]) ** 2 + 0.1 * 0.2**2),
+                (mpc.terminal_function(z, mpc.theta), 3.0 * (z[0] - z[1]) ** 2),
+            ):
+                assert float(found) == pytest.approx(expected)
