@@ -79,11 +79,10 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
         )
     if found.constant:
         _log.warning(
-            "%s: all costs are %g, so they do not tell what is good%s; stage and terminal cost stay the given ones, "
-            "and the model is learned",
+            "%s: every step costs %g%s: stage and terminal cost stay the given ones, the model alone is learned",
             known.table.name,
             found.offset,
-            ", but that episodes should not end, or should" if np.any(known.table.terminations) else "",
+            ", only ends tell what is good" if np.any(known.table.terminations) else "",
         )
     return replace(known, cost=found)
 

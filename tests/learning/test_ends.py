@@ -106,7 +106,7 @@ def test_from_a_bonus_for_being_alive_the_model_alone_is_learned(caplog: pytest.
     """Costs that are one number say nothing about the stage cost: it stays, with terminal cost and horizon."""
     learner = OfflineMPCLearner(mpc(), value_n_steps=30)
     learner.fit(walks(-1.0, 0.0), show_progress=False)
-    assert "all costs are -1, so they do not tell what is good, but that episodes" in caplog.text
+    assert "every step costs -1, only ends tell what is good" in caplog.text
     assert learner.mpc.horizon == 44
     for name, value in mpc().values.items():
         np.testing.assert_array_equal(learner.mpc.values[name], value)

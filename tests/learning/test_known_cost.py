@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpcoffline import MPC, Model, OfflineMPCLearner, QuadraticCost, TransitionTable
 from mpcoffline.core.errors import UnknownIdError
+from mpcoffline.diagnostics.measures import fit_errors
 from mpcoffline.learning import CostConfig, Known, known_cost
 from mpcoffline.learning.known_cost import with_known_cost
 
@@ -164,3 +166,22 @@ def test_what_is_no_way_to_treat_the_cost_is_refused() -> None:
     """The nearest names are in the message."""
     with pytest.raises(UnknownIdError, match="stage_cost"):
         CostConfig("known")  # type: ignore[arg-type]
+
+
+def test_a_learner_says_that_it_kept_the_cost(tmp_path: Path) -> None:
+    """Also in its file; and the error of (FIT) is that of the scaled cost."""
+    s, u = states_and_inputs()
+    log = table(s, u, 100.0 * quadratic(s, u) + 7.0)
+    learner = OfflineMPCLearner(mpc_of(), value_n_steps=30, hidden=(8,))
+    assert learner.findings == ()
+    learner.fit(log, show_progress=False)
+    assert "L = 100 Lhat +7" in str(learner)
+    learner.save(tmp_path / "learner.zip")
+    again = OfflineMPCLearner.load(tmp_path / "learner.zip")
+    assert again.result is not None
+    assert learner.result is not None
+    assert again.result.cost is not None
+    assert (again.result.cost, again.findings) == (learner.result.cost, learner.findings)
+    assert again.value_function is not None
+    errors = fit_errors(mpc_of(), again.mpc, again.value_function, log, again.result)
+    assert errors[0].after < 1e-3

@@ -161,7 +161,7 @@ class LearnParameters(Stage):
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds theta and the result."""
-        result = replace(training.result, residual_share=known.residual_share)
+        result = replace(training.result, residual_share=known.residual_share, cost=known.cost)
         return replace(known, mpc=known.mpc.with_theta(result.theta), result=result)
 
 
