@@ -185,3 +185,15 @@ def test_a_learner_says_that_it_kept_the_cost(tmp_path: Path) -> None:
     assert again.value_function is not None
     errors = fit_errors(mpc_of(), again.mpc, again.value_function, log, again.result)
     assert errors[0].after < 1e-3
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1.03, 0.0), (0.97, -4.0), (1.0, 1e-3)])
+def test_what_is_exact_is_said_as_it_is(scale: float, offset: float) -> None:
+    """A scale near 1 is no 1 where there is no noise, rounding is no offset."""
+    s, u = states_and_inputs()
+    found = known_cost(mpc_of(), table(s, u, scale * quadratic(s, u) + offset))
+    assert found is not None
+    assert found.scale == pytest.approx(scale, rel=1e-5)
+    assert found.offset == pytest.approx(offset, abs=2e-5 * max(1.0, abs(offset)))
+    assert (found.scale == 1.0) == (scale == 1.0)
+    assert (found.offset == 0.0) == (offset == 0.0)
