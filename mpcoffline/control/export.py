@@ -188,12 +188,13 @@ def _unambiguous_starts(policy: MPCPolicy) -> list[Array]:
 
 
 def _reached(mpc: MPC) -> tuple[Array, Array, Array]:
-    """The reference (zero without one), and between which states the starts are: where the inputs take the model.
+    """The reference (zero without one) at usual signals, and between which states the starts are.
 
-    That is the middle half of what an episode reaches from there, widened to twice its size; so it is in the plant's
-    own units.
+    These are where the inputs take the model: the middle half of what an episode reaches from there, widened to twice
+    its size; so it is in the plant's own units.
     """
-    inputs, centre = starts.candidate_inputs(mpc), np.zeros(mpc.ny) if mpc.reference is None else mpc.reference
+    inputs, reference = starts.candidate_inputs(mpc), mpc.reference
+    centre = mpc.state(np.zeros(mpc.layout.n_states) if reference is None else reference)[: mpc.ny]
     states = [mpc.state(np.broadcast_to(centre, (len(inputs), mpc.ny)))]
     for k in range(min(_STEPS, mpc.horizon)):
         states.append(mpc.model(states[-1], inputs[:, k]))

@@ -112,7 +112,7 @@ def input_units(mpc: MPC) -> Array:
         return np.ascontiguousarray(width)
     x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
     hessian, _ = ca.hessian(mpc.stage_function(x, u, theta), u)
-    at = np.zeros(mpc.nx) if mpc.reference is None else mpc.reference
+    at = mpc.state(np.zeros(mpc.layout.n_states) if mpc.reference is None else mpc.reference)
     level = np.clip(0.0, mpc.action_low, mpc.action_high)
     curvature = ca.Function("curvature", [x, u, theta], [ca.densify(ca.diag(hessian))])(at, level, mpc.theta)
     diagonal = np.abs(curvature.full().ravel())
