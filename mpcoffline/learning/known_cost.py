@@ -27,6 +27,7 @@ StageCostKind = Literal["fitted", "auto", "given"]
 _log = logging.getLogger(__name__)
 
 _ROWS = 20_000
+_CHUNK = 100_000  # rows that are looked at a time
 _BLOCK = 1_000  # consecutive rows that are taken together
 _EXACT = 1e-6  # share of the variance that rounding may leave open
 _NOISY = 0.05  # the same where noise in the states may be what is left
@@ -73,8 +74,8 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     _log.info("The stage cost is not learned but kept: %s", found)
     if found.agreeing < 1.0:
         _log.warning(
-            "the logged cost is the MPC's stage cost in %.0f %% of the transitions only; what it holds besides "
-            "elsewhere, as penalties or inputs cut off by the plant, is seen by V alone",
+            "the logged cost is the MPC's stage cost in %.0f %% of the transitions only, from which the model is "
+            "identified; what it is elsewhere, where the plant cuts off inputs or adds penalties, is seen by V alone",
             100.0 * found.agreeing,
         )
     if found.constant:
@@ -161,11 +162,37 @@ def _partly(ours: Array, logged: Array, inputs: Array) -> KnownCost | None:
         kept = np.argpartition(np.abs(logged - fit.scale * ours - fit.offset), count - 1)[:count]
         fit = _affine(ours[kept], logged[kept])
     for _ in range(2):  # those kept are the cheapest of the exact ones, whose rounding is the smallest
-        agree = np.abs(logged - fit.scale * ours - fit.offset) <= _DIGITS * logged[kept].std()
+        tolerance = _DIGITS * float(logged[kept].std())
+        agree = np.abs(logged - fit.scale * ours - fit.offset) <= tolerance
         if np.mean(agree) < _AGREEING or (inputs[agree].std(axis=0) < _LEAST_SPREAD * inputs.std(axis=0)).any():
             return None
         kept, fit = np.flatnonzero(agree), _affine(ours[agree], logged[agree])
-    return replace(_rounded(fit, ours[kept], logged[kept], np.sqrt(_EXACT)), agreeing=float(np.mean(agree)))
+    found = _rounded(fit, ours[kept], logged[kept], _EXACT)
+    return replace(found, agreeing=float(np.mean(agree)), tolerance=tolerance)
+
+
+def as_logged(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> TransitionTable:
+    """The transitions in which the plant took the logged input, as far as the costs tell.
+
+    Where a plant cuts off inputs (an inverter at its limits, a full tank), it pays and moves for another one than is
+    logged. Of such rows a model would learn an input that does less than it does.
+
+    Args:
+        mpc: Its stage cost is Lhat.
+        table: Transitions of its states.
+        cost: How logged costs follow from Lhat.
+
+    Returns:
+        The table itself where costs tell nothing.
+    """
+    if cost is None or cost.agreeing == 1.0:
+        return table
+    agreeing = []
+    for start in range(0, len(table), _CHUNK):
+        rows = table.take(slice(start, start + _CHUNK)).values()
+        ours = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full().ravel()
+        agreeing.append(np.abs(rows.costs - cost.scale * ours - cost.offset) <= cost.tolerance)
+    return table.take(np.flatnonzero(np.concatenate(agreeing)))
 
 
 def _rounded(fit: KnownCost, ours: Array, logged: Array, near: float) -> KnownCost:

@@ -76,6 +76,7 @@ class KnownCost:
         offset: In the unit of the logged costs.
         missed: Share of the variance of the logged costs that is not explained.
         agreeing: Share of the transitions that it holds for.
+        tolerance: Where that is not all: up to this, in the unit of the logged costs, it holds for one.
         constant: Whether all logged costs are one number, so that they say nothing about Lhat.
     """
 
@@ -83,13 +84,15 @@ class KnownCost:
     offset: float = 0.0
     missed: float = 0.0
     agreeing: float = 1.0
+    tolerance: float = 0.0
     constant: bool = False
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> KnownCost:
         """The inverse of ``dataclasses.asdict``."""
-        scale, offset, missed, agreeing = (float(data[name]) for name in ("scale", "offset", "missed", "agreeing"))
-        return cls(scale, offset, missed, agreeing, data["constant"] is True)
+        names = ("scale", "offset", "missed", "agreeing", "tolerance")
+        scale, offset, missed, agreeing, tolerance = (float(data[name]) for name in names)
+        return cls(scale, offset, missed, agreeing, tolerance, data["constant"] is True)
 
     def __str__(self) -> str:
         """The relation, in words."""

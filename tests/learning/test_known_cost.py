@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from mpcoffline import MPC, Model, OfflineMPCLearner, QuadraticCost, TransitionTable
 from mpcoffline.core.errors import UnknownIdError
 from mpcoffline.diagnostics.measures import fit_errors
-from mpcoffline.learning import CostConfig, Known, known_cost
-from mpcoffline.learning.known_cost import with_known_cost
+from mpcoffline.estimation import identify
+from mpcoffline.learning import CostConfig, Known, StartConfig, known_cost
+from mpcoffline.learning.bellman.stages import identified
+from mpcoffline.learning.known_cost import as_logged, with_known_cost
 
 Array = NDArray[np.float64]
 
@@ -197,3 +199,34 @@ def test_what_is_exact_is_said_as_it_is(scale: float, offset: float) -> None:
     assert found.offset == pytest.approx(offset, abs=2e-5 * max(1.0, abs(offset)))
     assert (found.scale == 1.0) == (scale == 1.0)
     assert (found.offset == 0.0) == (offset == 0.0)
+    cut = np.clip(u, -1.0, 1.0)
+    part = table(s, u, scale * quadratic(s, cut) + offset)
+    relation = known_cost(mpc_of(), part)
+    assert relation is not None
+    assert len(as_logged(mpc_of(), part, relation)) == pytest.approx(np.isclose(cut, u).sum(), abs=5)
+
+
+def test_a_model_is_identified_where_the_plant_took_the_logged_input() -> None:
+    """A cart whose drive gives at most 1: it moves, and pays, for what it gives."""
+    s, u = states_and_inputs(n_episodes=20)
+    given, f = np.clip(u, -1.0, 1.0), mpc_of().dynamics_function
+    for t in range(u.shape[1]):
+        s[:, t + 1] = f(s[:, t].T, given[:, t].T, mpc_of().theta).full().T
+    log = table(s, u, quadratic(s, given))
+
+    def ode(x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        return ca.vertcat(x[1], p["b"] * u[0] - p["c"] * x[1])
+
+    rough = mpc_of().replace(model=Model(ode, nx=2, nu=1, dt=0.1, parameters={"b": 0.7, "c": 0.3}))
+    cost = known_cost(rough, log)
+    assert cost is not None
+    assert cost.agreeing == pytest.approx(np.mean(given == u), abs=0.01)
+    assert cost.agreeing < 0.7
+    b, c = identify(rough, log).theta[:2]
+    assert abs(b - 1.0) > 0.2  # as all rows have it
+    b, c = identify(rough, as_logged(rough, log, cost)).theta[:2]
+    np.testing.assert_allclose([b, c], [1.0, 0.5], rtol=1e-3)
+    known = identified(Known(rough, log, cost=cost), StartConfig(init="identified"))
+    np.testing.assert_allclose(known.mpc.theta[:2], [1.0, 0.5], rtol=1e-3)
+    assert len(known.table) == len(log)
+    assert as_logged(rough, log, None) is log

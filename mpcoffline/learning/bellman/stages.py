@@ -12,10 +12,11 @@ import torch
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import fit_residual, identify, with_residual
+from mpcoffline.estimation import fit_residual, identify, smooth, with_residual
 from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.ends import ends_matter, priced_ends
+from mpcoffline.learning.known_cost import as_logged
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.potential import Potential
 from mpcoffline.learning.stages import Known, Stage, Training
@@ -81,16 +82,21 @@ def identified(known: Known, config: StartConfig) -> Known:
     if config.init == "nominal":
         return known
     tried = ["dead times"] if config.delays and known.value_function is None else []
-    found = identify(known.mpc, known.table, tried=tried, seed=known.seed)
+    rows = as_logged(known.mpc, known.table, known.cost)
+    found = identify(known.mpc, rows, tried=tried, seed=known.seed)
+    table = found.table
+    if rows is not known.table:
+        silent, identified = found.noise.negligible, known.mpc.replace(model=found.model)
+        table = known.table if silent else smooth(identified, known.table, found.theta, found.noise)
     if "model" not in known.groups:
-        return replace(known, table=found.table)
-    known = replace(known, mpc=known.mpc.replace(model=found.model), table=found.table, model_error=found.error_after)
+        return replace(known, table=table)
+    known = replace(known, mpc=known.mpc.replace(model=found.model), table=table, model_error=found.error_after)
     return completed(known) if config.residual and found.error_after > config.adapt_above else known
 
 
 def completed(known: Known) -> Known:
     """The identified model with a learned residual, where held-out episodes ask for one."""
-    residual = fit_residual(known.mpc, known.table, known.seed)
+    residual = fit_residual(known.mpc, as_logged(known.mpc, known.table, known.cost), known.seed)
     _log.info("%s", residual)
     if not residual.taken:
         return known
