@@ -132,6 +132,8 @@ def learn(
         print_json({"learner": out, "policy": policy_file, "seconds": seconds} | _described(learner, data))
         return
     console.print(_parameter_table(learner))
+    for finding in learner.findings:
+        say(escape(finding))
     say_file("Learner", out)
     say_file("Policy", policy_file)
     env_id = data.spec.env_spec.id if data.spec.env_spec is not None else "ENV_ID"
@@ -229,6 +231,7 @@ def _described(learner: OfflineMPCLearner, data: MinariDataset) -> dict[str, Any
         "horizon": learner.mpc.horizon,
         "loss_before": None if fitted is None else fitted.loss_before,
         "loss_after": None if fitted is None else fitted.loss_after,
+        "findings": list(learner.findings),
         "nominal": learner.nominal_mpc.values,
         "learned": learner.mpc.values,
         "history": [{"epoch": epoch} | metrics for epoch, metrics in learner.history],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import Identification, identify
+from mpcoffline.estimation import Identification, fit_residual, identify, with_residual
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
@@ -94,6 +95,8 @@ def diagnose(
     table = with_memory(TransitionTable.of(dataset), learned.layout)
     found = identify(nominal, table, seed=seed)
     clean, identified = found.table, nominal.replace(model=found.model)
+    if learner.result is not None and learner.result.residual_share is not None:
+        found, identified = _completed(found, identified, seed)
     ensemble = Ensemble(identified, clean, found, seed=seed)
     seen = None if sees_memory(learned.layout, learned.stage_cost) else learned.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
@@ -121,6 +124,7 @@ def diagnose(
         noise=found.noise,
         goal_share=None if reference is None else goal_share(clean, reference),
         failed_solves=(policies[0].solver_stats.failed_share, policies[1].solver_stats.failed_share),
+        findings=learner.findings,
         n_rows=len(table),
         n_episodes=table.n_episodes,
         traces=Traces(
@@ -131,6 +135,16 @@ def diagnose(
         ),
     )
     return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
+
+
+def _completed(found: Identification, identified: MPC, seed: int) -> tuple[Identification, MPC]:
+    """The identified model with a learned residual, as in the fit: without, all models here would lack the same."""
+    residual = fit_residual(identified, found.table, seed)
+    if not residual.taken:
+        return found, identified
+    mpc = with_residual(identified, residual)
+    errors = np.full_like(found.errors_after, residual.one_step[1])
+    return replace(found, model=mpc.model, errors_after=errors), mpc
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:

@@ -130,13 +130,13 @@ def fit_errors(
         learned: The learned MPC.
         value: V_phi.
         table: The transitions.
-        result: What (FIT) found; its potential, if there is one, counts.
+        result: What (FIT) found; its potential, if there is one, and the scale of a known cost count.
     """
     sample = table.sample(_ROWS, 0)
     columns = sample.columns(torch.from_numpy(sample.rows))
-    unit = cost_spread(sample.costs)
+    unit, cost = cost_spread(sample.costs), None if result is None else result.cost
     before, after = (
-        _residuals(BellmanProblem(mpc, value, unit), mpc, columns)
+        _residuals(BellmanProblem(mpc, value, unit, cost), mpc, columns)
         for mpc in (nominal.replace(discount=learned.discount), learned)
     )
     potential = None if result is None else result.potential

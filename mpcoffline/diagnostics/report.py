@@ -65,6 +65,7 @@ class Report:
         noise: Measurement and process noise.
         goal_share: Share of the logged states near the reference; None without reference.
         failed_solves: Share of the simulations' MPCs that were not solved at first: MPC_1's, the learned MPC's.
+        findings: What the fit found beside the parameters; see :attr:`mpcoffline.OfflineMPCLearner.findings`.
         n_rows: Transitions.
         n_episodes: Episodes.
         traces: What the figure shows besides; not in the JSON form.
@@ -85,6 +86,7 @@ class Report:
     noise: NoiseEstimate
     goal_share: float | None
     failed_solves: tuple[float, float]
+    findings: tuple[str, ...]
     n_rows: int
     n_episodes: int
     traces: Traces = field(repr=False, compare=False)
@@ -93,8 +95,8 @@ class Report:
         """The report as plain text."""
         c, p, ratios = self.comparison, self.prediction, np.array(self.comparison.ratios)
         lines = [f"Verdict: {self.verdict}", *map(_item, self.reasons)]
-        if self.notes:
-            lines += ["Notes", *map(_item, self.notes)]
+        for title, items in (("Notes", self.notes), ("What the fit found", self.findings)):
+            lines += [title, *map(_item, items)] if items else []
         rows = [
             ("data", f"{self.n_rows} rows, {self.n_episodes} episodes"),
             ("models, starts, steps", f"{len(ratios)}, {c.n_starts}, {c.n_steps}"),

@@ -108,8 +108,8 @@ def states(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
 def rows(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     """Whether there are as many numbers as parameters."""
     n, n_parameters = len(log.table), int(mpc.space.mask(("cost", "model")).sum())
-    if n * (mpc.ny + 1) < 3 * n_parameters:
-        expected = f"at least {-(-3 * n_parameters // (mpc.ny + 1))} rows for {n_parameters} parameters"
+    if n * (mpc.layout.n_states + 1) < 3 * n_parameters:
+        expected = f"at least {-(-3 * n_parameters // (mpc.layout.n_states + 1))} rows for {n_parameters} parameters"
         hint = "Record more, or give fewer parameters (what is a plain number in the model is not learned)."
         yield Finding("rows", expected, str(n), hint)
 
@@ -122,10 +122,11 @@ def ranges(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     reference = mpc.reference
     if reference is not None:
         matters = _matters(mpc, log)
+        matters[list(getattr(mpc.stage_cost, "tracks", {}))] = False  # there it is the distance from a signal
         for i in np.flatnonzero(matters & (low < high)).tolist():
             yield from _apart(f"observation {i}", "the reference", reference[i], reference[i], low[i], high[i])
     for bounds in mpc.state_bounds:
-        bottom, top = (np.asarray(each)[: mpc.ny] for each in (bounds.low, bounds.high))
+        bottom, top = (np.asarray(each)[: len(low)] for each in (bounds.low, bounds.high))
         for i in np.flatnonzero(np.isfinite(bottom) & np.isfinite(top) & (low < high)).tolist():
             yield from _apart(f"observation {i}", f"bounds {bounds.name!r}", bottom[i], top[i], low[i], high[i])
 

@@ -53,10 +53,10 @@ class Reading(NamedTuple):
 
     Attributes:
         x: States, ``(m, n)``.
-        u: Inputs, ``(m, nu)``.
+        u: Inputs, then the present signals, ``(m, nu + n_signals)``.
         reached: States after them, ``(m, n)``.
         cost: Logged costs, ``(m,)``.
-        u_next: Inputs of the rows after, ``(m, nu)``; NaN where there is none.
+        u_next: Inputs of the rows after, beside the signals of the same; NaN where there is none.
     """
 
     x: Array
@@ -100,15 +100,13 @@ class Judged(NamedTuple):
 
 
 def model(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
-    """Whether the log, read otherwise, is what the model predicts; not asked where there are signals, yet."""
-    if mpc.layout.signals:
-        return
-    reading = _rows(log)
-    if len(reading.x) < max(_FEW, 5 * (mpc.ny + mpc.nu)):
+    """Whether the log, read otherwise, is what the model predicts; signals are taken as they are."""
+    reading, n = _rows(log, mpc.nu), mpc.layout.n_states
+    if len(reading.x) < max(_FEW, 5 * (n + mpc.nu)):
         return
     judge = _Judge(mpc, reading)
     plain = judge.identified(reading)
-    if plain.good[: mpc.ny].all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
+    if plain.good[:n].all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
         yield from _late(judge, reading, plain)
         return
     plain = judge.identified(reading, _PATIENCE)  # it may not have come to its end
@@ -164,7 +162,7 @@ def _gain(plain: Judged, found: Judged) -> float:
 def _finding(guess: Guess, plain: Judged, found: Judged, mpc: MPC) -> Finding:
     ratio = np.maximum(plain.errors, plain.floor) / np.maximum(found.errors, found.floor)
     i = int(np.argmax(ratio))
-    what = f"observation {i}'s motion" if i < mpc.ny else "the costs' spread, by the stage cost"
+    what = f"observation {i}'s motion" if i < mpc.layout.n_states else "the costs' spread, by the stage cost"
     if ratio[i] > 2.0:
         actual = (
             f"data of which the model, its parameters the best within their bounds, leaves {plain.errors[i]:.0%} of"
@@ -178,10 +176,11 @@ def _finding(guess: Guess, plain: Judged, found: Judged, mpc: MPC) -> Finding:
     return Finding(guess.name, guess.expected, actual, guess.hint)
 
 
-def _rows(log: Excerpt) -> Reading:
+def _rows(log: Excerpt, nu: int) -> Reading:
     """Some of the rows, those with a row after them where there are enough."""
     u_next = np.full_like(log.u, np.nan)
     u_next[:-1][log.together] = log.u[1:][log.together]
+    u_next[:, nu:] = log.u[:, nu:]
     use = np.flatnonzero(~log.ended)
     followed = use[np.isfinite(u_next[use]).all(axis=1)]
     if len(followed) >= _FEW:
@@ -290,7 +289,7 @@ def _promising(judge: _Judge, reading: Reading, guesses: list[Guess]) -> list[Gu
 
 def _guesses(mpc: MPC) -> list[Guess]:
     """All of them, the simplest first."""
-    nx, nu = mpc.ny, mpc.nu
+    nx, nu = mpc.layout.n_states, mpc.nu
     found = [*_signs(nx, nu), *_exchanges(nx, nu), *_sampling(mpc.model.dt)]
     single: list[_Columns] = [((i,), ()) for i in range(nx)] + [((), (j,)) for j in range(nu)]
     pairs: list[_Columns] = [(pair, ()) for pair in combinations(range(nx), 2)] if nx > 2 else []

@@ -23,6 +23,7 @@ from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction
 from mpcoffline.mpc import MPC
 
 from .checkpoint import Checkpoint, History, history_from_json
+from .findings import findings
 from .presets import PRESETS
 from .run import Run
 
@@ -134,6 +135,18 @@ class OfflineMPCLearner:
             state += f", dead time {list(self._mpc.layout.delay)}"
         how = f"method={type(self.method).__name__}" if self.preset is None else f"preset={self.preset!r}"
         return f"{type(self).__name__}(learn={self.learn!r}, {how}, seed={self.seed}; {state})"
+
+    def __str__(self) -> str:
+        """The same, and what was found beside the parameters."""
+        return "\n".join([repr(self), *(f"  {each}" for each in self.findings)])
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What the fit found of plant and costs beside the parameters, in sentences; none before ``fit``.
+
+        Whether the logged cost is the MPC's, dead time, integrator, learned residual.
+        """
+        return findings(self.nominal_mpc, self._mpc, self.result) if isinstance(self._mpc, MPC) else ()
 
     def fit(
         self,

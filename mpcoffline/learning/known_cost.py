@@ -37,7 +37,7 @@ _AGREEING = 1.0 / 3.0  # share of the transitions that suffices, if exact: what 
 _DIGITS = 1e-4  # of the spread, to which these agree one by one
 _LEAST_SPREAD = 0.3  # of s and a there, in that of all: near rest any smooth costs agree
 _STARTS, _ROUNDS = 100, 10
-_AS_WRITTEN = 0.05  # a scale this near to 1 is 1: noise in the states draws it towards 0
+_AS_WRITTEN = 0.05  # under noise in the states, which draws it towards 0, a scale this near to 1 is 1
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,10 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
         )
     if found.constant:
         _log.warning(
-            "%s: all costs are %g, so they do not tell what is good%s; stage and terminal cost stay the given ones, "
-            "and the model is learned",
+            "%s: every step costs %g%s: stage and terminal cost stay the given ones, the model alone is learned",
             known.table.name,
             found.offset,
-            ", but that episodes should not end, or should" if np.any(known.table.terminations) else "",
+            ", only ends tell what is good" if np.any(known.table.terminations) else "",
         )
     return replace(known, cost=found)
 
@@ -111,11 +110,11 @@ def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True) -> Known
         return None
     fit = _affine(ours, logged)
     if fit.scale > 0.0 and fit.missed <= _EXACT:
-        return _as_written(fit)
+        return _rounded(fit, ours, logged, np.sqrt(_EXACT))
     if noise and fit.scale > 0.0 and fit.missed <= _NOISY:
         residual = logged - fit.scale * ours - fit.offset
         if _correlation(residual, pairs) <= _WHITE and _explained(inputs, residual) <= _EXPLAINED:
-            return _as_written(fit)
+            return _rounded(fit, ours, logged, _AS_WRITTEN)
     return _partly(ours, logged, inputs)
 
 
@@ -168,7 +167,8 @@ def _partly(ours: Array, logged: Array, inputs: Array) -> KnownCost | None:
         if np.mean(agree) < _AGREEING or (inputs[agree].std(axis=0) < _LEAST_SPREAD * inputs.std(axis=0)).any():
             return None
         kept, fit = np.flatnonzero(agree), _affine(ours[agree], logged[agree])
-    return replace(_as_written(fit), agreeing=float(np.mean(agree)), tolerance=tolerance)
+    found = _rounded(fit, ours[kept], logged[kept], _EXACT)
+    return replace(found, agreeing=float(np.mean(agree)), tolerance=tolerance)
 
 
 def as_logged(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> TransitionTable:
@@ -195,9 +195,11 @@ def as_logged(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> Trans
     return table.take(np.flatnonzero(np.concatenate(agreeing)))
 
 
-def _as_written(fit: KnownCost) -> KnownCost:
-    """The relation with a scale of 1 where it is as good as that."""
-    return replace(fit, scale=1.0) if abs(fit.scale - 1.0) <= _AS_WRITTEN else fit
+def _rounded(fit: KnownCost, ours: Array, logged: Array, near: float) -> KnownCost:
+    """The relation with a scale of 1 where it is as near to that, and without an offset where that is rounding."""
+    scale = 1.0 if abs(fit.scale - 1.0) <= near else fit.scale
+    offset = float(np.mean(logged - scale * ours))
+    return replace(fit, scale=scale, offset=offset if abs(offset) > _EXACT * float(logged.std()) else 0.0)
 
 
 def _correlation(residual: Array, pairs: NDArray[np.intp]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,6 +35,7 @@ class FitResult:
         potential: The potential that was fitted with the cost, if one was.
         residual_share: The share of what the identified model missed that a learned residual explains; None where the
             model has none.
+        cost: How the logged costs follow from the MPC's stage cost, where that was kept; None where it was learned.
     """
 
     theta: NDArray[np.float64]
@@ -43,6 +44,7 @@ class FitResult:
     at_bounds: tuple[str, ...] = ()
     potential: Potential | None = None
     residual_share: float | None = None
+    cost: KnownCost | None = None
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description, without theta."""
@@ -52,6 +54,7 @@ class FitResult:
             "at_bounds": list(self.at_bounds),
             "potential": None if self.potential is None else self.potential.to_json(),
             "residual_share": self.residual_share,
+            "cost": None if self.cost is None else asdict(self.cost),
         }
 
     @classmethod
@@ -60,7 +63,8 @@ class FitResult:
         potential = None if data["potential"] is None else Potential.from_json(data["potential"])
         at_bounds = tuple(map(str, data["at_bounds"]))
         share = None if data["residual_share"] is None else float(data["residual_share"])
-        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential, share)
+        cost = None if data["cost"] is None else KnownCost.from_json(data["cost"])
+        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential, share, cost)
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,13 @@ class KnownCost:
     agreeing: float = 1.0
     tolerance: float = 0.0
     constant: bool = False
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> KnownCost:
+        """The inverse of ``dataclasses.asdict``."""
+        names = ("scale", "offset", "missed", "agreeing", "tolerance")
+        scale, offset, missed, agreeing, tolerance = (float(data[name]) for name in names)
+        return cls(scale, offset, missed, agreeing, tolerance, data["constant"] is True)
 
     def __str__(self) -> str:
         """The relation, in words."""

@@ -36,6 +36,18 @@ def mpc_of(case: str) -> MPC:
             delay=[2, 0],
         )
         return MPC(model, cost, QuadraticCost(np.eye(2)), 12, 0.95, [-1.0, -1.0], [1.0, 1.0])
+    if case == "signals":
+        signals = [Signal("set_point", preview=1), Signal("wind", usual=0.3)]
+        model = Model(
+            lambda x, u, p, d: ca.vertcat(x[0] + 0.1 * x[1], 0.9 * x[1] + ca.sin(u[0]) + 0.1 * d.wind),
+            2,
+            1,
+            0.1,
+            discrete=True,
+            signals=signals,
+        )
+        cost, end = (QuadraticCost(np.eye(2), R, tracks={0: "set_point"}) for R in ([[0.1]], None))
+        return MPC(model, cost, end, 12, 0.95, [-1.0], [1.0])
     if case == "stiff motor":  # exact
         model = Model(
             lambda x, u, p: ca.vertcat(100.0 * (x[1] - x[0]), (u[0] - p["R"] * x[1] - 0.05 * x[0]) / p["L"]),

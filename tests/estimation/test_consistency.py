@@ -12,7 +12,17 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 import mpcoffline
-from mpcoffline import MPC, InvalidDataError, Model, Parameter, QuadraticCost, StateBounds, TransitionTable, nominal_mpc
+from mpcoffline import (
+    MPC,
+    InvalidDataError,
+    Model,
+    Parameter,
+    QuadraticCost,
+    Signal,
+    StateBounds,
+    TransitionTable,
+    nominal_mpc,
+)
 from mpcoffline.estimation.findings import CHECKS, Finding
 
 Array = NDArray[np.float64]
@@ -247,3 +257,45 @@ def test_checks_are_added_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CHECKS, "_things", dict(CHECKS.items()))
     CHECKS.add("mine", lambda mpc, log: iter([Finding("moon", "none", f"{len(log)} rows", "Look up.")]))
     assert str(mpcoffline.check(arm_mpc(), LOG.table())) == "warning: moon: expected none, got 1200 rows. Look up."
+
+
+def room_mpc(low: float, high: float) -> MPC:
+    """Two temperatures in kelvin beside that of the outside; the first follows a set-point."""
+
+    def step(x: ca.SX, u: ca.SX, p: dict[str, ca.SX], d: Any) -> ca.SX:
+        wall = 0.9 * x[1] + 0.1 * d.outside
+        return ca.vertcat(x[0] + 0.2 * (x[1] - x[0]) + p["gain"] * u, wall)
+
+    signals = [Signal("set_point"), Signal("outside", usual=280.0)]
+    model = Model(step, 2, 1, 60.0, {"gain": Parameter(1.5, low=0.1, high=10.0)}, discrete=True, signals=signals)
+    cost = QuadraticCost(np.diag([1.0, 0.0]), [[0.1]], tracks={0: "set_point"})
+    bounds = StateBounds(low=[low] * 4, high=[high] * 4)
+    return MPC(model, cost, QuadraticCost(np.eye(2)), 20, 0.95, [0.0], [4.0], constraints=[bounds])
+
+
+def room_log(sign: float = 1.0, order: tuple[int, ...] = (0, 1, 2, 3)) -> TransitionTable:
+    rng, rows = np.random.default_rng(0), []
+    for episode in range(12):
+        x, outside = rng.uniform(262.0, 285.0, 2), rng.uniform(262.0, 285.0)
+        for _ in range(50):
+            point, u = rng.uniform(262.0, 285.0), rng.uniform(0.0, 4.0)
+            reached = np.array([x[0] + 0.2 * (x[1] - x[0]) + sign * u, 0.9 * x[1] + 0.1 * outside])
+            y, outside = [*x, point, outside], outside + 0.3 * rng.normal()
+            y_next = [*reached, point, outside]
+            rows.append((y, [u], (x[0] - point) ** 2 + 0.1 * u**2, y_next, False, episode))
+            x = reached
+    s, *others, reached, end, ids = (np.array(column) for column in zip(*rows, strict=True))
+    return TransitionTable.from_arrays(s[:, order], *others, reached[:, order], end, ids)
+
+
+def test_signals_are_no_states() -> None:
+    """What follows a set-point has no reference of its own, and bounds may be on signals, too."""
+    assert mpcoffline.check(room_mpc(200.0, 400.0), room_log()).ok
+    assert "observation 0" in str(mpcoffline.check(room_mpc(-20.0, 20.0), room_log()))
+
+
+@pytest.mark.parametrize(
+    ("log", "words"), [({"sign": -1.0}, "the sign of action 0"), ({"order": (1, 0, 2, 3)}, "0 and 1 are exchanged")]
+)
+def test_logs_with_signals_are_read_otherwise_too(log: dict[str, Any], words: str) -> None:
+    assert words in str(mpcoffline.check(room_mpc(200.0, 400.0), room_log(**log)))

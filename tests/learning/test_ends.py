@@ -9,8 +9,9 @@ import torch
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from mpcoffline import MPC, Model, OfflineMPCLearner, QuadraticCost, TransitionTable
-from mpcoffline.learning import fit_terminal
+from mpcoffline import MPC, Model, NetworkCost, OfflineMPCLearner, QuadraticCost, TransitionTable
+from mpcoffline.learning import Known, TerminalConfig, fit_terminal
+from mpcoffline.learning.bellman.stages import with_terminal_cost
 from mpcoffline.learning.ends import ends_matter, innermost, priced_ends
 
 Array = NDArray[np.float64]
@@ -106,8 +107,17 @@ def test_from_a_bonus_for_being_alive_the_model_alone_is_learned(caplog: pytest.
     """Costs that are one number say nothing about the stage cost: it stays, with terminal cost and horizon."""
     learner = OfflineMPCLearner(mpc(), value_n_steps=30)
     learner.fit(walks(-1.0, 0.0), show_progress=False)
-    assert "all costs are -1, so they do not tell what is good, but that episodes" in caplog.text
+    assert "every step costs -1, only ends tell what is good" in caplog.text
     assert learner.mpc.horizon == 44
     for name, value in mpc().values.items():
         np.testing.assert_array_equal(learner.mpc.values[name], value)
     assert OfflineMPCLearner(mpc(), horizon=9).method.restructured(mpc()).horizon == 9
+
+
+def test_the_terminal_cost_of_a_linear_quadratic_mpc_knows_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its exact value does not: where the model goes on, the plant has ended."""
+    table = walks(0.0, 30.0, varied=1.0)
+    monkeypatch.setattr(Known, "constant_value", property(lambda _: lambda s: torch.zeros(len(s))))
+    for log, kind in ((table, NetworkCost), (walks(1.0, 1.2, varied=1.0), QuadraticCost)):
+        found = with_terminal_cost(Known(mpc(), log), TerminalConfig("auto"))
+        assert isinstance(found.mpc.terminal_cost, kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpcoffline import MPC, Model, OfflineMPCLearner, QuadraticCost, TransitionTable
 from mpcoffline.core.errors import UnknownIdError
+from mpcoffline.diagnostics.measures import fit_errors
 from mpcoffline.estimation import identify
 from mpcoffline.learning import CostConfig, Known, StartConfig, known_cost
 from mpcoffline.learning.bellman.stages import identified
@@ -166,6 +168,42 @@ def test_what_is_no_way_to_treat_the_cost_is_refused() -> None:
     """The nearest names are in the message."""
     with pytest.raises(UnknownIdError, match="stage_cost"):
         CostConfig("known")  # type: ignore[arg-type]
+
+
+def test_a_learner_says_that_it_kept_the_cost(tmp_path: Path) -> None:
+    """Also in its file; and the error of (FIT) is that of the scaled cost."""
+    s, u = states_and_inputs()
+    log = table(s, u, 100.0 * quadratic(s, u) + 7.0)
+    learner = OfflineMPCLearner(mpc_of(), value_n_steps=30, hidden=(8,))
+    assert learner.findings == ()
+    learner.fit(log, show_progress=False)
+    assert "L = 100 Lhat +7" in str(learner)
+    learner.save(tmp_path / "learner.zip")
+    again = OfflineMPCLearner.load(tmp_path / "learner.zip")
+    assert again.result is not None
+    assert learner.result is not None
+    assert again.result.cost is not None
+    assert (again.result.cost, again.findings) == (learner.result.cost, learner.findings)
+    assert again.value_function is not None
+    errors = fit_errors(mpc_of(), again.mpc, again.value_function, log, again.result)
+    assert errors[0].after < 1e-3
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1.03, 0.0), (0.97, -4.0), (1.0, 1e-3)])
+def test_what_is_exact_is_said_as_it_is(scale: float, offset: float) -> None:
+    """A scale near 1 is no 1 where there is no noise, rounding is no offset."""
+    s, u = states_and_inputs()
+    found = known_cost(mpc_of(), table(s, u, scale * quadratic(s, u) + offset))
+    assert found is not None
+    assert found.scale == pytest.approx(scale, rel=1e-5)
+    assert found.offset == pytest.approx(offset, abs=2e-5 * max(1.0, abs(offset)))
+    assert (found.scale == 1.0) == (scale == 1.0)
+    assert (found.offset == 0.0) == (offset == 0.0)
+    cut = np.clip(u, -1.0, 1.0)
+    part = table(s, u, scale * quadratic(s, cut) + offset)
+    relation = known_cost(mpc_of(), part)
+    assert relation is not None
+    assert len(as_logged(mpc_of(), part, relation)) == pytest.approx(np.isclose(cut, u).sum(), abs=5)
 
 
 def test_a_model_is_identified_where_the_plant_took_the_logged_input() -> None:

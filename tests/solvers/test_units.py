@@ -206,3 +206,15 @@ def test_small_constraints_are_constraints(scale: float) -> None:
     solution = make_solver(mpc).solve([1.0, 0.0])
     assert solution.success
     np.testing.assert_allclose(np.abs(solution.u).max(), 0.5, rtol=1e-6)
+
+
+def test_unbounded_inputs_of_a_state_with_past_inputs_have_a_size() -> None:
+    """By the stage cost at the reference; Riccati knows the plan."""
+    model = Model(
+        lambda x, u, _: ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.1 * u[0] - 0.2 * u[1]), 2, 2, 0.1, discrete=True, delay=2
+    )
+    reference, free = [1.0, 0.0], [np.inf, np.inf]
+    cost, end = (QuadraticCost(np.eye(2), R, x_ref=reference) for R in (0.1 * np.eye(2), None))
+    mpc = MPC(model, cost, end, HORIZON, DISCOUNT, [-np.inf, -np.inf], free)
+    z = mpc.state([0.3, -0.2])
+    np.testing.assert_allclose(make_solver(mpc, "ddp").solve(z).u, make_solver(mpc, "lqr").solve(z).u, atol=1e-6)

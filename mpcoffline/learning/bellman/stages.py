@@ -167,7 +167,7 @@ class LearnParameters(Stage):
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds theta and the result."""
-        result = replace(training.result, residual_share=known.residual_share)
+        result = replace(training.result, residual_share=known.residual_share, cost=known.cost)
         return replace(known, mpc=known.mpc.with_theta(result.theta), result=result)
 
 
@@ -178,8 +178,8 @@ class TerminalConfig:
     Attributes:
         method: ``"given"`` keeps the given one's, ``"norm"`` is (TERM), ``"quadratic"`` and ``"network"`` are fitted
             to V, as Theorem 1 asks for (doi:10.1109/TAC.2019.2913768); ``"auto"`` is the exact value of the learned
-            MPC where it has one, with an affine model and a quadratic stage cost
-            (:func:`~mpcoffline.learning.linear_quadratic.riccati_cost`), else ``"network"``.
+            MPC where it has one, with an affine model, a quadratic stage cost
+            (:func:`~mpcoffline.learning.linear_quadratic.riccati_cost`) and no ends at a price, else ``"network"``.
         blend: Share of the convex quadratic in ``"network"``: steadier at short horizons.
     """
 
@@ -204,7 +204,8 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
         mpc = known.mpc if horizon is not None or known.given is None else _as_far_as(known.given, known.mpc)
         return replace(known, mpc=mpc)
     goal = settled(known.mpc, known.table)
-    exact = riccati_cost(known.mpc) if config.method == "auto" else None
+    unpriced = config.method == "auto" and not ends_matter(known.table, known.mpc.discount)  # ends are no part of f
+    exact = riccati_cost(known.mpc) if unpriced else None
     cost: TerminalCost = NormCost(goal) if exact is None else exact
     if exact is not None:
         _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from logged_plants import pendulum_log, pendulum_mpc, tank_log, tank_mpc
 
+import mpcoffline
 from mpcoffline import OfflineMPCLearner
 from mpcoffline.learning.bellman.stages import StartConfig, identified
 from mpcoffline.learning.stages import Known
@@ -47,6 +48,7 @@ def test_a_learner_keeps_it(tmp_path: Path) -> None:
     learner.fit(table, show_progress=False)
     assert learner.result is not None
     assert learner.result.residual_share is not None
+    assert "explains" in str(learner)
     learner.save(tmp_path / "learner.zip")
     again = OfflineMPCLearner.load(tmp_path / "learner.zip")
     assert again.result is not None
@@ -55,3 +57,7 @@ def test_a_learner_keeps_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.mpc.model(x, u), learner.mpc.model(x, u), rtol=1e-12)
     plain = learner.nominal_mpc.with_theta(np.concatenate([learner.mpc.theta[:2], learner.nominal_mpc.theta[2:]]))
     assert not np.allclose(plain.model(x, u), learner.mpc.model(x, u))
+    report = mpcoffline.diagnose(learner, table, n_starts=1, n_steps=2)
+    assert report.prediction.identified < 0.1 * report.prediction.nominal  # its models have one, too
+    assert not report.lag.found
+    assert "explains" in str(report)
