@@ -49,7 +49,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What :func:`check` found; empty where description and data agree as far as the data tell.
+    """What :func:`mpcoffline.check` found; empty where description and data agree as far as the data tell.
 
     Attributes:
         findings: Errors first.

@@ -47,7 +47,7 @@ class Residual:
         taken: Whether held-out episodes say, beyond chance, that the model predicts one step and many better with it.
         share: The share of the squared one-step error on held-out episodes that it explains.
         one_step: Root mean square one-step error there in spreads of the increments, without and with it.
-        far: The same after :data:`STEPS` steps open loop, in spreads of the states.
+        far: The same after 15 steps open loop, in spreads of the states.
     """
 
     network: SmallNetwork | None

@@ -40,7 +40,7 @@ class MultiStepCheck:
     Attributes:
         steps: After how many steps, ``(15, 50)``, or what the stretches of the log allow.
         errors: Root mean square error of the identified model after so many steps.
-        refitted: The same of the parameters that predict :data:`HORIZON` steps of the other episodes best.
+        refitted: The same of the parameters that predict 25 steps of the other episodes best.
         tried: What of the structure was varied, in words.
     """
 

@@ -179,7 +179,7 @@ class TerminalConfig:
         method: ``"given"`` keeps the given one's, ``"norm"`` is (TERM), ``"quadratic"`` and ``"network"`` are fitted
             to V, as Theorem 1 asks for (doi:10.1109/TAC.2019.2913768); ``"auto"`` is the exact value of the learned
             MPC where it has one, with an affine model, a quadratic stage cost
-            (:func:`~mpcoffline.learning.linear_quadratic.riccati_cost`) and no ends at a price, else ``"network"``.
+            (by its Riccati equation) and no ends at a price, else ``"network"``.
         blend: Share of the convex quadratic in ``"network"``: steadier at short horizons.
     """
 
