@@ -6,6 +6,7 @@ import csv
 import io
 import logging
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ import numpy as np
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import FileFormatError, StorageError
 from mpcoffline.core.tables import Table
+from mpcoffline.core.text import markdown
 from mpcoffline.core.types import Array
 from mpcoffline.learner.learner import OfflineMPCLearner
 
@@ -301,7 +303,7 @@ def summarised(outcomes: Sequence[Outcome]) -> Summary:
 
 
 _HEADER = ["plant", "seed", "behaviour", "MPC_1", "yardstick", "learned", "learned - MPC_1", "learned - yardstick"]
-_HEADER += ["ends well: MPC_1/yardstick/learned", "fit (s)", "build (s)", "said"]
+_HEADER += ["ends well: MPC_1/yardstick/learned", "fit (s)", "build (s)"]
 
 
 def report(outcomes: Sequence[Outcome]) -> str:
@@ -329,8 +331,19 @@ def report(outcomes: Sequence[Outcome]) -> str:
     judged = any(o.verdict for o in rows)
     header = _HEADER + ["verdict"] * judged
     cells = [_cells(o) + [o.verdict] * judged for o in rows]
-    table = Table(header, cells, align="lrrrrrrrrrrl")
-    return "\n".join([*lines, "", table.markdown()]) + "\n"
+    table = Table(header, cells, align="lrrrrrrrrrr" + "l" * judged)
+    lines += ["", table.markdown(), "", *_sayings(rows)]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _sayings(rows: Sequence[Outcome]) -> list[str]:
+    """What the learner said, once a plant where only numbers differ; a column of it would make the table unreadable."""
+    first: dict[tuple[str, str], Outcome] = {}
+    for o in rows:
+        first.setdefault((o.plant, re.sub(r"[\d.]+", "", o.said)), o)
+    said = [f"* {o.plant} {o.seed}: {markdown(o.said)}" for o in first.values() if o.said]
+    intro = ["## What the learner said", "", "Where it is the same but for numbers, for the first seed.", ""]
+    return [*intro, *said] if said else []
 
 
 def _cells(o: Outcome) -> list[str]:
@@ -338,7 +351,7 @@ def _cells(o: Outcome) -> list[str]:
     ends = "/".join("-" if np.isnan(e) else f"{e:.2f}" for e in (o.ends_mpc_1, o.ends_yardstick, o.ends_learned))
     differences = [_pair(o.gain, o.gain_error), _pair(o.short, o.short_error)]
     times = ["-" if np.isnan(t) else f"{t:.0f}" for t in (o.fit_s, o.build_s)]
-    return [o.plant, str(o.seed), *costs, *differences, ends, *times, o.error or o.said]
+    return [o.plant, str(o.seed), *costs, *differences, ends, *times]
 
 
 def _number(value: float) -> str:

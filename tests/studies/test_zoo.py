@@ -92,8 +92,8 @@ def test_results_survive_a_torn_line(tmp_path: Path) -> None:
 
 def test_counts_know_no_sign_of_the_cost() -> None:
     rows = [
-        outcome(100.0, 90.0, 89.0, seed=0),  # better, close, room
-        outcome(100.0, 103.0, 90.0, seed=1),  # worse, far, room
+        outcome(100.0, 90.0, 89.0, seed=0, said="off by 3"),  # better, close, room
+        outcome(100.0, 103.0, 90.0, seed=1, said="off by 4.5"),  # worse, far, room
         outcome(-100.0, -103.0, -104.0, seed=2),  # better, close, room
         outcome(-100.0, -97.0, -101.0, seed=3),  # worse, close, no room
         outcome(-100.0, -99.0, seed=4),  # no yardstick
@@ -108,6 +108,9 @@ def test_counts_know_no_sign_of_the_cost() -> None:
     assert "**3 of 6**; cart 1 (+3 +- 0.1); cart 3 (+3 +- 0.1); cart 5" in page
     assert "**3 of 4**" in page
     assert "**2 of 3**" in page
+    assert page.endswith(
+        "## What the learner said\n\nWhere it is the same but for numbers, for the first seed.\n\n* cart 0: off by 3\n"
+    )
     assert "Failed: cart 6: x" in page
 
 
