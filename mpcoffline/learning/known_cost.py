@@ -74,16 +74,18 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     _log.info("The stage cost is not learned but kept: %s", found)
     if found.agreeing < 1.0:
         _log.warning(
-            "the logged cost is the MPC's stage cost in %.0f %% of the transitions only, from which the model is "
-            "identified; what it is elsewhere, where the plant cuts off inputs or adds penalties, is seen by V alone",
+            "the logged cost is the MPC's stage cost in %.0f %% of the transitions only%s; what it is elsewhere, where "
+            "the plant cuts off inputs or adds penalties, is seen by V alone",
             100.0 * found.agreeing,
+            ", from which the model is identified" if "model" in known.groups else "",
         )
     if found.constant:
         _log.warning(
-            "%s: every step costs %g%s: stage and terminal cost stay the given ones, the model alone is learned",
+            "%s: every step costs %g%s: stage and terminal cost stay the given ones%s",
             known.table.name,
             found.offset,
             ", only ends tell what is good" if np.any(known.table.terminations) else "",
+            ", the model alone is learned" if "model" in known.groups else "",
         )
     return replace(known, cost=found)
 

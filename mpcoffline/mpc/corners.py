@@ -17,7 +17,7 @@ from mpcoffline.core.types import Array
 
 from .expressions import expanded, instructions
 from .problem import MPC
-from .rest import at_rest
+from .rest import at_rest, extreme_inputs
 
 _COMPARED = {ca.OP_FMAX: "fmax", ca.OP_FMIN: "fmin", ca.OP_LT: "if_else", ca.OP_LE: "if_else"}
 _OF_ONE = {ca.OP_FABS: "fabs", ca.OP_SIGN: "sign", ca.OP_SQRT: "sqrt", ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow"}
@@ -72,9 +72,8 @@ def rounded_mpc(mpc: MPC, share: float) -> tuple[MPC, list[Corner]]:
 def _visited(mpc: MPC) -> tuple[Array, Array]:
     """States ``(nx, n)`` and inputs ``(nu, n)`` of the rollouts; those that are finite."""
     rng = np.random.default_rng(0)
-    low, high = (np.asarray(bound, np.float64) for bound in (mpc.action_low, mpc.action_high))
-    low, high = np.where(np.isfinite(low), low, np.minimum(-1.0, high - 2)), np.where(np.isfinite(high), high, 1.0)
-    high = np.maximum(high, low + 1e-12 * (1 + np.abs(low)))
+    extremes = extreme_inputs(mpc)
+    low, high = extremes.min(axis=0), extremes.max(axis=0)
     share = np.clip(rng.uniform(-0.5, 1.5, (mpc.nu, 64)), 0.0, 1.0)
     x = np.repeat(at_rest(mpc)[:, None], share.shape[1], axis=1)
     states, inputs = [], []

@@ -70,9 +70,14 @@ def integrated(ode: ca.Function, scheme: Scheme, dt: float, x: ca.SX, u: ca.SX, 
         x: States.
         u: Inputs.
         theta: The model's flat parameters.
+
+    Raises:
+        InvalidArgumentError: For more operations than an expression may have; before any is made.
     """
     if scheme.kind == "exact":
         return _exponential(ode, scheme.substeps, dt, x, u, theta)
+    count, hint = 4 * scheme.substeps * ode.n_instructions(), "Take fewer substeps."
+    check_limit("integrator", "operations", count, limits.EXPRESSION_NODES, hint=hint, error=InvalidArgumentError)
     for _ in range(scheme.substeps):
         x = rk4_expression(lambda state: ode(state, u, theta), x, dt / scheme.substeps)
     return x

@@ -361,7 +361,7 @@ class Model(Component):
         """
         model = cls.__new__(cls)
         layout = Layout.of(data["nx"], data["nu"], data["delay"], [Signal.from_json(s) for s in data["signals"]])
-        if data["previous"]:
+        if data["previous"] is True:
             layout = layout.with_previous()
         model.dt, model.delay = float(data["dt"]), None if data["delay"] is None else layout.delay
         if not (np.isfinite(model.dt) and model.dt > 0.0):

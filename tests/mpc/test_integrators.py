@@ -305,3 +305,16 @@ def test_torch_has_the_same_steps(model: Model) -> None:
     theta = torch.from_numpy(model.space.theta)
     twin = TorchTwin(model.function)(torch.from_numpy(x), torch.from_numpy(u), theta)
     np.testing.assert_allclose(twin.numpy(), model(x, u), rtol=1e-12)
+
+
+def test_a_step_of_more_operations_than_may_be_is_refused_before_it_is_made() -> None:
+    """As a small file could ask for: 64 substeps of an ODE that is long already."""
+
+    def ode(x: ca.SX, u: ca.SX, _: object) -> ca.SX:
+        for _ in range(5_000):
+            x = ca.sin(x)
+        return x + u
+
+    document = Model(ode, 1, 1, 0.1, integrator="rk4").to_json()
+    with pytest.raises(InvalidArgumentError, match="operations"):
+        Model.from_json(document | {"integrator": "rk4:64", "scheme": "rk4:64"})
