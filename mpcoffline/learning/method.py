@@ -77,6 +77,14 @@ class Method(ABC):
         """What the stages begin with, found from all transitions; by default what is known already."""
         return known
 
+    def candidates(self, known: Known) -> dict[str, MPC]:
+        """MPCs that the fit knows by the way and that may do better than the whole of it; by default none.
+
+        Args:
+            known: What is known at the end of the fit.
+        """
+        return {}
+
     @property
     def name(self) -> str:
         """What it is called in calls and files.

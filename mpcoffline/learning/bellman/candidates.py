@@ -1,0 +1,73 @@
+"""MPCs that a fit knows by the way: each takes from the log a part of what the whole fit takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+from mpcoffline.estimation import fit_residual, with_residual
+from mpcoffline.learning.known_cost import as_logged
+from mpcoffline.learning.stages import Known
+from mpcoffline.mpc import MPC
+
+from .stages import TerminalConfig, in_units_of, with_terminal_cost
+
+_log = logging.getLogger(__name__)
+
+_MISSED = 0.01  # of an increment, above which a residual is looked for
+
+
+def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
+    """The MPCs between MPC_1 and the whole fit, by name.
+
+    * ``"identified"``: the identified model, all else as given;
+    * ``"identified, preset's horizon"``: the same with horizon and discount of the whole fit;
+    * ``"identified, V"``: the identified model, the given stage cost, and V as the terminal cost;
+    * ``"fitted, given terminal cost"``: model and stage cost of the whole fit, all else as given;
+    * each of these and the whole fit ``"with residual"``, where held-out episodes ask for a learned residual.
+
+    What is the same as another is left out; so is V as terminal cost where V says nothing.
+
+    Args:
+        known: What is known at the end of the fit.
+        terminal: How the terminal cost follows from V.
+    """
+    given, full = known.given, known.mpc
+    if given is None or known.found is None:
+        return {}
+    model = known.found.model if "model" in known.groups else full.model
+    own = given.replace(model=given.model.with_delay(full.model.delay))
+    if known.cost is not None:
+        own = own.replace(stage_cost=full.stage_cost)  # with the logged weights, where these were taken over
+    plain = own.replace(model=model)
+    found = {"identified": plain}
+    farther = plain.replace(horizon=full.horizon, discount=full.discount)
+    if farther != plain and (full.horizon, full.discount) != (given.horizon, given.discount):
+        found["identified, preset's horizon"] = farther
+    if known.cost is None:
+        alike = in_units_of(farther, known.table)
+        found["fitted, given terminal cost"] = in_units_of(plain, known.table).replace(
+            model=full.model, stage_cost=full.stage_cost
+        )
+        if terminal.method != "given" and known.value_function is not None:
+            result = None if known.result is None else dataclasses.replace(known.result, potential=None)
+            start = dataclasses.replace(known, mpc=alike, result=result)
+            found["identified, V"] = with_terminal_cost(start, terminal).mpc
+    return found | _with_residuals(known, {**found, "full": full})
+
+
+def _with_residuals(known: Known, mpcs: dict[str, MPC]) -> dict[str, MPC]:
+    """Those with the identified model, with a learned residual where held-out episodes ask for one."""
+    if known.found is None or known.residual_share is not None or "model" not in known.groups:
+        return {}
+    if known.found.error_after < _MISSED:
+        return {}
+    identified = known.mpc.replace(model=known.found.model)
+    residual = fit_residual(identified, as_logged(identified, known.table, known.cost), known.seed)
+    _log.info("%s", residual)
+    if not residual.taken:
+        return {}
+    same = {name: mpc for name, mpc in mpcs.items() if name != "fitted, given terminal cost"}
+    return {
+        f"{name}, residual": with_residual(mpc.replace(model=identified.model), residual) for name, mpc in same.items()
+    }
