@@ -125,7 +125,7 @@ def tried(
     known: Known,
     between: Mapping[str, MPC],
     table: TransitionTable,
-    tell: Callable[[str, int, int], None],
+    tell: Callable[[int, int, str], None],
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -134,7 +134,7 @@ def tried(
         known: What is known at the end of the fit.
         between: The MPCs between.
         table: The transitions as they were logged.
-        tell: Is told what is done: what, how many steps of how many.
+        tell: Is told how many starts of how many are done, and what is tried.
     """
     mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
     if known.found is None:

@@ -22,8 +22,9 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
+from mpcoffline.simulation.choice import FIRST
 
-from .candidates import FIRST, FULL, TRIALS, Candidates, tried
+from .candidates import FULL, TRIALS, Candidates, tried
 from .checkpoint import Checkpoint, History, history_from_json
 from .findings import findings
 from .presets import PRESETS

@@ -55,5 +55,5 @@ def surroundings_of(
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
     rows = initial_rows(clean, n_starts, seed)
     rows = np.random.default_rng([seed, 1]).permutation(rows)  # those that judge are like those that choose
-    n_steps = n_steps or int(min(_MOST_STEPS, np.max(table.episodes.lengths)))
+    n_steps = n_steps or min(_MOST_STEPS, int(table.episodes.lengths.max()))
     return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -94,7 +94,7 @@ class Trials:
         return np.asarray(costs[self.names.index(name)] - costs[0])
 
     def improves(self, name: str) -> bool:
-        """Whether a controller costs less than MPC_1 on the median model from the judging starts, by both regressions."""
+        """Whether it costs less than MPC_1 on the median model from the starts that judge, by both regressions."""
         gains = (self.differences(name, second=second)[self.votes][:, self.judged] for second in (False, True))
         return all(np.median(gain.mean(axis=1)) < 0.0 for gain in gains)
 
@@ -110,7 +110,7 @@ class Trials:
             FileFormatError: For arrays that are missing, or of other shapes or types.
         """
         n = np.size(arrays.get("rows", ()))
-        shapes = {name: (len(names), len(models), n) for name in ("cost", "second", "lost")}
+        shapes: dict[str, tuple[int, ...]] = {name: (len(names), len(models), n) for name in ("cost", "second", "lost")}
         shapes |= {"votes": (len(models),), "n_steps": ()} | dict.fromkeys(("rows", "returns", "judged"), (n,))
         for name, kind in _ARRAYS.items():
             array = arrays.get(name)
@@ -119,15 +119,6 @@ class Trials:
                 raise FileFormatError(f"trials/{name}", expected=f"shape {shapes[name]}, kind {kind}", actual=actual)
         parts = {name: arrays[name] for name in _ARRAYS if name != "n_steps"}
         return cls(names=names, models=models, n_steps=int(arrays["n_steps"]), **parts)
-
-    def joined(self, others: Sequence[Trials]) -> Trials:
-        """With trials of further controllers on the same models from the same starts."""
-        parts = [self, *others]
-        return replace(
-            self,
-            names=tuple(name for part in parts for name in part.names),
-            **{key: np.concatenate([getattr(part, key) for part in parts]) for key in ("cost", "second", "lost")},
-        )
 
 
 @dataclass(frozen=True)

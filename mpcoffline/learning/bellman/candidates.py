@@ -21,9 +21,9 @@ def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
     """The MPCs between MPC_1 and the whole fit, by name.
 
     * ``"identified"``: the identified model, all else as given;
-    * ``"identified, preset's horizon"``: the same with horizon and discount of the whole fit;
+    * ``"identified, farther"``: the same with horizon and discount of the whole fit;
     * ``"identified, V"``: the identified model, the given stage cost, and V as the terminal cost;
-    * ``"fitted, given terminal cost"``: model and stage cost of the whole fit, all else as given;
+    * ``"fitted cost"``: model and stage cost of the whole fit, all else as given;
     * each of these and the whole fit ``"with residual"``, where held-out episodes ask for a learned residual.
 
     What is the same as another is left out; so is V as terminal cost where V says nothing.
@@ -43,12 +43,10 @@ def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
     found = {"identified": plain}
     farther = plain.replace(horizon=full.horizon, discount=full.discount)
     if farther != plain and (full.horizon, full.discount) != (given.horizon, given.discount):
-        found["identified, preset's horizon"] = farther
+        found["identified, farther"] = farther
     if known.cost is None:
         alike = in_units_of(farther, known.table)
-        found["fitted, given terminal cost"] = in_units_of(plain, known.table).replace(
-            model=full.model, stage_cost=full.stage_cost
-        )
+        found["fitted cost"] = in_units_of(plain, known.table).replace(model=full.model, stage_cost=full.stage_cost)
         if terminal.method != "given" and known.value_function is not None:
             result = None if known.result is None else dataclasses.replace(known.result, potential=None)
             start = dataclasses.replace(known, mpc=alike, result=result)
@@ -67,7 +65,7 @@ def _with_residuals(known: Known, mpcs: dict[str, MPC]) -> dict[str, MPC]:
     _log.info("%s", residual)
     if not residual.taken:
         return {}
-    same = {name: mpc for name, mpc in mpcs.items() if name != "fitted, given terminal cost"}
+    same = {name: mpc for name, mpc in mpcs.items() if name != "fitted cost"}
     return {
         f"{name}, residual": with_residual(mpc.replace(model=identified.model), residual) for name, mpc in same.items()
     }
