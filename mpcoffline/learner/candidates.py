@@ -65,6 +65,24 @@ class Candidates(Mapping[str, MPC]):
         """How many there are."""
         return len(self.mpcs)
 
+    @property
+    def finding(self) -> str:
+        """Which one was chosen and why, in a sentence."""
+        if self.trials is None:
+            return f"Handed out: {self.chosen!r}, as was asked."
+        votes = int(self.trials.votes.sum())
+        if not votes:
+            return "Handed out: MPC_1. No model predicts the log, so nothing could be tried."
+        where = f"of {len(self)} candidates in closed loop with {votes} models of the log"
+        if self.chosen == FIRST:
+            return f"Handed out: MPC_1, the best {where}."
+        gain = np.nanmean(self.trials.differences(self.chosen)[self.trials.votes], axis=1)
+        level = np.nanmean(self.trials.of(FIRST)[self.trials.votes], axis=1)
+        return (
+            f"Handed out: {self.chosen!r}, the best {where}: an episode costs {np.median(gain):+.3g} beside MPC_1's"
+            f" {np.median(level):.4g}."
+        )
+
     def __str__(self) -> str:
         """A line each: cost of an episode less that of MPC_1, over the models that have a vote."""
         width = max(map(len, self.mpcs))
@@ -143,9 +161,9 @@ def tried(
     trials, chosen = choose(mpcs, around, tell)
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:
-        logger.warning("No candidate is better than MPC_1 on models of the log: MPC_1 is handed out.\n%s", found)
+        logger.warning("%s\n%s", found.finding, found)
     else:
-        logger.info("Handed out: %s\n%s", chosen, found)
+        logger.info("%s\n%s", found.finding, found)
     return found
 
 

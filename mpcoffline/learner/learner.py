@@ -156,9 +156,12 @@ class OfflineMPCLearner:
     def findings(self) -> tuple[str, ...]:
         """What the fit found of plant and costs beside the parameters, in sentences; none before ``fit``.
 
-        Whether the logged cost is the MPC's, dead time, integrator, learned residual.
+        Whether the logged cost is the MPC's, dead time, integrator, learned residual; which candidate is handed out.
         """
-        return findings(self.nominal_mpc, self._mpc, self.result) if isinstance(self._mpc, MPC) else ()
+        if not isinstance(self._mpc, MPC):
+            return ()
+        chosen = () if self.candidates is None else (self.candidates.finding,)
+        return (*findings(self.nominal_mpc, self._mpc, self.result), *chosen)
 
     def fit(
         self,

@@ -34,8 +34,15 @@ class Members:
     """
 
     def __init__(self, mpc: MPC, thetas: Array, residuals: Sequence[Residual]) -> None:
+        self._mpc, self._residuals = mpc, residuals
         self._twin, self.thetas = TorchTwin(mpc.plant_function), thetas
         self._networks = _Networks(residuals) if residuals else None
+
+    def some(self, kept: NDArray[np.bool_]) -> Members:
+        """Some of them, ``(m,)`` of truth values."""
+        first = len(self) - len(self._residuals)
+        residuals = [each for each, keep in zip(self._residuals, kept[first:], strict=True) if keep]
+        return Members(self._mpc, self.thetas[kept], residuals)
 
     def __len__(self) -> int:
         """Number of members."""

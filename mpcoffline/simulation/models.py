@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,12 @@ class LogModels:
         """
         best = float(np.min(self.errors))
         return np.asarray((self.errors <= VOTES * max(best, NEGLIGIBLE)) & (best < self.baseline))
+
+    def asked(self) -> LogModels:
+        """Those that have a vote, and the identified one."""
+        kept = self.votes | (np.arange(len(self)) == 0)
+        names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
+        return replace(self, names=names, errors=self.errors[kept], members=self.members.some(kept))
 
     def step(self, x: Array, u: Array) -> Array:
         """The successors of states ``(m, starts, nx)`` under inputs ``(m, starts, nu)``, each member its own.
