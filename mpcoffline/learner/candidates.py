@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -21,6 +22,9 @@ from mpcoffline.simulation.trials import Trials
 
 FULL = "full"
 TRIALS = "trials/"  # in front of the names of their arrays in a file
+
+_SLOW = 10.0  # times as fast as ipopt, below which all starts on all models would take an hour
+_FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3
 
 logger = logging.getLogger(__name__)
 
@@ -157,7 +161,9 @@ def tried(
     mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    around = surroundings_of(known.mpc, nominal, table, known.found, seed=known.seed)
+    slow = any(MPCPolicy(mpc).solver.relative_speed < _SLOW for mpc in (nominal, known.mpc))
+    effort = {"n_starts": _FEW_STARTS, "most_steps": _FEW_STEPS, "most_models": _FEW_MODELS} if slow else {}
+    around = surroundings_of(known.mpc, nominal, table, known.found, seed=known.seed, **effort)
     trials, chosen = choose(mpcs, around, tell)
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:

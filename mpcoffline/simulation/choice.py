@@ -35,7 +35,7 @@ def choose(
         The trials, and the name of the best.
     """
     names, total = list(mpcs), len(around.rows)
-    ends = [max(1, round(total * end / STARTS)) for end in _ROUNDS]
+    ends = sorted({max(1, round(total * end / STARTS)) for end in _ROUNDS})
     trials = Trials.none(names, around, judged=np.arange(total) >= ends[-1])
     if not trials.votes.any():
         return trials, FIRST

@@ -125,9 +125,11 @@ class LogModels:
         best = float(np.min(self.errors))
         return np.asarray((self.errors <= VOTES * max(best, NEGLIGIBLE)) & (best < self.baseline))
 
-    def asked(self) -> LogModels:
-        """Those that have a vote, and the identified one."""
-        kept = self.votes | (np.arange(len(self)) == 0)
+    def asked(self, most: int | None = None) -> LogModels:
+        """Those that have a vote, no more than the best of some number, and the identified one."""
+        kept, best = self.votes, np.argsort(self.errors, kind="stable")
+        kept[best[len(best) if most is None else most :]] = False
+        kept[0] = True
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
         return replace(self, names=names, errors=self.errors[kept], members=self.members.some(kept))
 

@@ -27,6 +27,8 @@ def surroundings_of(
     *,
     n_starts: int = STARTS,
     n_steps: int | None = None,
+    most_steps: int = _MOST_STEPS,
+    most_models: int | None = None,
     seed: int = 0,
 ) -> Surroundings:
     """Builds all that controllers are tried in.
@@ -37,7 +39,9 @@ def surroundings_of(
         table: The transitions as they were logged.
         found: What was identified.
         n_starts: Number of episodes on each model.
-        n_steps: Their length; that of the longest logged one by default, at most 400.
+        n_steps: Their length; that of the longest logged one by default.
+        most_steps: What that is at most.
+        most_models: Take no more than the best of so many, beside the identified one.
         seed: Of models, starts and noise.
 
     Raises:
@@ -50,10 +54,10 @@ def surroundings_of(
         clean = found.table
     elif not found.noise.negligible:
         clean = smooth(identified, logged, found.theta, found.noise)
-    models = LogModels.of(identified, clean, found, seed=seed)
+    models = LogModels.of(identified, clean, found, seed=seed).asked(most_models)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
     rows = initial_rows(clean, n_starts, seed)
     rows = np.random.default_rng([seed, 1]).permutation(rows)  # those that judge are like those that choose
-    n_steps = n_steps or min(_MOST_STEPS, int(table.episodes.lengths.max()))
+    n_steps = n_steps or min(most_steps, int(table.episodes.lengths.max()))
     return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)
