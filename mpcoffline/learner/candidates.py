@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.choice import FIRST, choose
+from mpcoffline.simulation.choice import FIRST, choose, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
 
@@ -147,6 +146,7 @@ def tried(
     known: Known,
     between: Mapping[str, MPC],
     table: TransitionTable,
+    variants: Callable[[str, MPC], Mapping[str, MPC]],
     tell: Callable[[int, int, str], None],
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
@@ -156,15 +156,16 @@ def tried(
         known: What is known at the end of the fit.
         between: The MPCs between.
         table: The transitions as they were logged.
+        variants: Of a good one.
         tell: Is told how many starts of how many are done, and what is tried.
     """
     mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    slow = any(MPCPolicy(mpc).solver.relative_speed < _SLOW for mpc in (nominal, known.mpc))
+    slow = any(quick_policy(mpc).solver.relative_speed < _SLOW for mpc in (nominal, known.mpc))
     effort = {"n_starts": _FEW_STARTS, "most_steps": _FEW_STEPS, "most_models": _FEW_MODELS} if slow else {}
     around = surroundings_of(known.mpc, nominal, table, known.found, seed=known.seed, **effort)
-    trials, chosen = choose(mpcs, around, tell)
+    trials, chosen = choose(mpcs, around, variants, tell)
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:
         logger.warning("%s\n%s", found.finding, found)

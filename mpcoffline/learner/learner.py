@@ -272,7 +272,8 @@ class OfflineMPCLearner:
         between = {} if self.candidate == FULL else run.method.candidates(known)
         if self.candidate == "auto":
             show = partial(bars.show, "choosing on models of the log")
-            return tried(self.nominal_mpc, known, between, table, show) if between else None
+            variants = partial(run.method.variants, known)
+            return tried(self.nominal_mpc, known, between, table, variants, show) if between else None
         found = Candidates({FIRST: self.nominal_mpc, **between, FULL: known.mpc}, self.candidate)
         _ = found.mpc  # refuses a name that is none of them
         return None if self.candidate == FULL else found

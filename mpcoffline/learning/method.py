@@ -85,6 +85,16 @@ class Method(ABC):
         """
         return {}
 
+    def variants(self, known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
+        """What may be better than one of the candidates and is tried where that one is good; by default nothing.
+
+        Args:
+            known: What is known at the end of the fit.
+            name: The candidate's name.
+            mpc: The candidate.
+        """
+        return {}
+
     @property
     def name(self) -> str:
         """What it is called in calls and files.

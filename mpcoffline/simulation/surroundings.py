@@ -17,6 +17,7 @@ from .models import LogModels
 from .trials import Surroundings
 
 _MOST_STEPS = 400
+_ENOUGH = 16  # episodes, from which on all start where one of the log did
 
 
 def surroundings_of(
@@ -57,6 +58,8 @@ def surroundings_of(
     models = LogModels.of(identified, clean, found, seed=seed).asked(most_models)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
+    if _ENOUGH <= clean.n_episodes < n_starts:  # others than these begin nearer to where a controller rests
+        n_starts = clean.n_episodes
     rows = initial_rows(clean, n_starts, seed)
     rows = np.random.default_rng([seed, 1]).permutation(rows)  # those that judge are like those that choose
     n_steps = n_steps or min(most_steps, int(table.episodes.lengths.max()))

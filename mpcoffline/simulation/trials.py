@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -83,6 +83,15 @@ class Trials:
         done, k = around.act(controller, starts), self.names.index(name)
         self.cost[k, :, starts], self.second[k, :, starts], self.lost[k, :, starts] = done.cost, done.second, done.lost
         return done
+
+    def with_names(self, more: Sequence[str]) -> Trials:
+        """With further controllers, not tried yet."""
+        if not more:
+            return self
+        shape = len(more), *self.cost.shape[1:]
+        cost, second = (np.concatenate([costs, np.full(shape, np.nan)]) for costs in (self.cost, self.second))
+        lost = np.concatenate([self.lost, np.zeros(shape, dtype=bool)])
+        return replace(self, names=(*self.names, *more), cost=cost, second=second, lost=lost)
 
     def of(self, name: str) -> Array:
         """The costs of a controller, ``(models, starts)``."""

@@ -23,8 +23,7 @@ def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
     * ``"identified"``: the identified model, all else as given;
     * ``"identified, farther"``: the same with horizon and discount of the whole fit;
     * ``"identified, V"``: the identified model, the given stage cost, and V as the terminal cost;
-    * ``"fitted cost"``: model and stage cost of the whole fit, all else as given;
-    * each of these and the whole fit ``"with residual"``, where held-out episodes ask for a learned residual.
+    * ``"fitted cost"``: model and stage cost of the whole fit, all else as given.
 
     What is the same as another is left out; so is V as terminal cost where V says nothing.
 
@@ -51,21 +50,21 @@ def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
             result = None if known.result is None else dataclasses.replace(known.result, potential=None)
             start = dataclasses.replace(known, mpc=alike, result=result)
             found["identified, V"] = with_terminal_cost(start, terminal).mpc
-    return found | _with_residuals(known, {**found, "full": full})
+    return found
 
 
-def _with_residuals(known: Known, mpcs: dict[str, MPC]) -> dict[str, MPC]:
-    """Those with the identified model, with a learned residual where held-out episodes ask for one."""
-    if known.found is None or known.residual_share is not None or "model" not in known.groups:
+def with_learned_residual(known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
+    """A candidate whose model is the identified one, with a learned residual where held-out episodes ask for one.
+
+    Args:
+        known: What is known at the end of the fit.
+        name: The candidate's name.
+        mpc: The candidate.
+    """
+    found, learned = known.found, "model" in known.groups and known.residual_share is None
+    if not learned or found is None or found.error_after < _MISSED or mpc.layout != known.mpc.layout:
         return {}
-    if known.found.error_after < _MISSED:
-        return {}
-    identified = known.mpc.replace(model=known.found.model)
-    residual = fit_residual(identified, as_logged(identified, known.table, known.cost), known.seed)
+    mpc = mpc.replace(model=found.model)
+    residual = fit_residual(mpc, as_logged(mpc, known.table, known.cost), known.seed)
     _log.info("%s", residual)
-    if not residual.taken:
-        return {}
-    same = {name: mpc for name, mpc in mpcs.items() if name != "fitted cost"}
-    return {
-        f"{name}, residual": with_residual(mpc.replace(model=identified.model), residual) for name, mpc in same.items()
-    }
+    return {f"{name}, residual": with_residual(mpc, residual)} if residual.taken else {}
