@@ -5,12 +5,22 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from .errors import FileFormatError, InvalidArgumentError, visible
 
-__all__ = ["LONGEST", "c_comment", "c_identifiers", "check_name", "check_unit", "markdown", "markdown_code", "visible"]
+__all__ = [
+    "LONGEST",
+    "c_comment",
+    "c_identifiers",
+    "check_name",
+    "check_unit",
+    "listed",
+    "markdown",
+    "markdown_code",
+    "visible",
+]
 
 LONGEST = 100  # characters of a name or a unit
 _SIGNS = frozenset(" _-.,^*/()[]+%°µ·0123456789⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻")
@@ -105,6 +115,18 @@ def _spelled(character: str) -> str:
     """A character without ASCII form in letters and digits."""
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
     return plain if plain.isalnum() else f"u{ord(character):04x}" if character.isalpha() else "_"
+
+
+def listed(names: Sequence[str], most: int = 6, *, joint: str = ", ") -> str:
+    """Names in a sentence, the first few of many: ``"a, b, c and 37 more"``.
+
+    Args:
+        names: The names.
+        most: How many are named.
+        joint: What stands between them.
+    """
+    told = joint.join(names[:most])
+    return f"{told} and {len(names) - most} more" if len(names) > most else told
 
 
 def c_comment(text: str) -> str:

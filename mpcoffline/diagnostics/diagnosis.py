@@ -10,7 +10,6 @@ import numpy as np
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
-from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, fit_residual, identify, with_residual
@@ -27,7 +26,7 @@ from .figure import Traces
 from .measures import (
     bound_names,
     fit_errors,
-    goal_share,
+    goal_check,
     lag_check,
     one_step_error,
     outside_support,
@@ -35,8 +34,9 @@ from .measures import (
     returns_of,
     value_check,
 )
+from .notes import Fit, notes_on
 from .report import PredictionCheck, Report
-from .stability import TheoremCheck, closed_loop_eigenvalues, value_growth, weight_checks
+from .stability import TheoremCheck, closed_loop_eigenvalues, leaves_reference, value_growth, weight_checks
 from .verdict import Comparison, decide
 
 if TYPE_CHECKING:
@@ -45,9 +45,6 @@ if TYPE_CHECKING:
 _STARTS = 20
 _FEW_STARTS = 3
 _SLOW = 10.0  # times as fast as ipopt, below which simulating all starts takes minutes
-_SCARCE_GOAL = 1e-3
-_BLIND_VALUE = 0.3
-_WORSE_MODEL = 2.0
 
 
 def diagnose(
@@ -116,13 +113,13 @@ def diagnose(
         value=value_check(learner.value_function, clean, learned.discount),
         fit=fit_errors(nominal, learned, learner.value_function, clean, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
-        theorem=_theorem(learned, policies[1], learner.value_function, clean, second, reference),
-        weights=weight_checks(nominal, learned),
+        theorem=_theorem(learned, policies[1], learner.value_function, clean, second),
+        weights=weight_checks(nominal, learned, clean),
         at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
         lag=lag,
         noise=found.noise,
-        goal_share=None if reference is None else goal_share(clean, reference),
+        goal=goal_check(nominal, clean),
         failed_solves=(policies[0].solver_stats.failed_share, policies[1].solver_stats.failed_share),
         findings=learner.findings,
         n_rows=len(table),
@@ -134,7 +131,9 @@ def diagnose(
             reference,
         ),
     )
-    return report.with_notes(_notes(report, smoothed=learner.method.options.get("init") == "identified"))
+    cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
+    fit = Fit(learner.method.options.get("init") == "identified", learner.learn == "cost+model", not cost_kept)
+    return report.with_notes(notes_on(report, fit))
 
 
 def _completed(found: Identification, identified: MPC, seed: int) -> tuple[Identification, MPC]:
@@ -158,49 +157,14 @@ def _theorem(
     value: ValueFunction,
     table: TransitionTable,
     simulation: Simulation,
-    reference: Array | None,
 ) -> TheoremCheck:
     """The condition of Theorem 1, along rollouts on the identified model."""
     states = simulation.states.reshape(-1, learned.nx)
-    return TheoremCheck(
-        value_growth(value, table, states, bool(simulation.lost[0].any())),
-        outside_support(table, states),
-        () if reference is None else closed_loop_eigenvalues(learned, policy.solver, table, settled(learned, table)),
+    found = TheoremCheck(
+        value_growth(value, table, states, bool(simulation.lost[0].any())), outside_support(table, states), ()
     )
-
-
-def _notes(report: Report, *, smoothed: bool) -> tuple[str, ...]:
-    """What explains the verdict or may spoil the next fit, with what to do; ``smoothed``: the fit did so, too."""
-    notes = []
-    if report.goal_share is not None and report.goal_share < _SCARCE_GOAL:
-        notes.append("The log never reaches the goal: V is a guess there. Record episodes that end at the reference.")
-    if not report.noise.negligible:
-        advice = "as in the fit" if smoothed else "fit with init='identified', which does the same"
-        notes.append(f"Measurement noise of {report.noise.level:.1%}: states were smoothed here; {advice}.")
-    if report.value.n and report.value.correlation < _BLIND_VALUE:
-        notes.append("V hardly follows the measured returns: learn it longer, or by another method.")
-    if report.prediction.learned > _WORSE_MODEL * report.prediction.identified + 0.01:
-        advice = "a larger prediction_weight keeps it closer" if smoothed else "init='identified' is the safer start"
-        notes.append(
-            f"The learned model misses {report.prediction.learned:.1%} of an increment, the identified one"
-            f" {report.prediction.identified:.1%}: Theorem 1 allows that, but {advice}."
-        )
-    if report.prediction.undetermined:
-        notes.append(
-            f"The data do not determine {', nor '.join(report.prediction.undetermined)}: vary the"
-            " inputs more; or, if they enter the model as ratios alone, fix one of them as a plain number."
-        )
-    if report.at_bounds:
-        notes.append(f"On a bound: {', '.join(report.at_bounds)}. Widen it if the physics allow, or raise the prior.")
-    if report.theorem.value_growth > 1.5:
-        notes.append(
-            "V grows along the model's rollouts beyond anything in the data: Theorem 1's condition is doubtful."
-        )
-    if report.theorem.eigenvalues and report.theorem.eigenvalues[0] > 1.0 + 1e-3:
-        notes.append("The learned closed loop is unstable at the reference, on its own model: do not use it there.")
-    for weight in report.weights:
-        if weight.after[0] < 1e-6 * max(weight.after[-1], 1e-300) and weight.before[0] > 1e-6 * weight.before[-1]:
-            notes.append(
-                f"{weight.name} has lost a direction (smallest eigenvalue 0): raise the prior if that one matters."
-            )
-    return tuple(notes)
+    if learned.reference is None:
+        return found
+    rest = settled(learned, table)
+    moduli = closed_loop_eigenvalues(learned, policy.solver, table, rest)
+    return replace(found, eigenvalues=moduli, leaves=moduli[:1] > (1.0,) and leaves_reference(policy, table, rest))

@@ -15,7 +15,7 @@ from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.learning import FitResult, ValueFunction
 from mpcoffline.learning.bellman.equation import BellmanProblem
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, QuadraticCost
 from mpcoffline.mpc.coordinates import Coordinates
 from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale, spread_of
 
@@ -25,6 +25,10 @@ _MOST_EPISODES = 200
 _TAIL = 0.05  # share of a discounted return that may lie beyond the episode's end
 _REGIONS = 4
 _NEAR = 0.25  # spreads of the data: a state this close to the reference has reached it
+_SCARCE = 1e-3
+_WEIGHED = 1e-4  # of the largest weight: less is none
+_BLIND = 0.3  # correlation of V with returns below which it may not have been learned,
+_BLINDER = 0.2  # if a regression of the returns does better by this
 _LAGS = 6  # steps before the present that are looked at, fewer where episodes are short
 _LAG_FEATURES = 100
 _MUCH_LAG = 0.05  # of the effect of the present input
@@ -42,12 +46,20 @@ class ValueCheck:
         correlation: Spearman's rank correlation.
         bias: Mean of V minus return, in standard deviations of the returns.
         above: Share of the states where V exceeds the return by more than a standard deviation.
+        attainable: Correlation of a regression on the state, with returns of other episodes: where what happens does
+            not follow from the state (unmeasured disturbances), no V correlates.
     """
 
     n: int
     correlation: float
     bias: float
     above: float
+    attainable: float
+
+    @property
+    def blind(self) -> bool:
+        """Whether V does not follow returns that follow from the state."""
+        return self.n > 0 and self.correlation < min(_BLIND, self.attainable - _BLINDER)
 
 
 @dataclass(frozen=True)
@@ -85,19 +97,42 @@ class LagCheck:
         return self.share > _MUCH_LAG and self.p_value < 1e-6
 
 
+@dataclass(frozen=True)
+class GoalCheck:
+    """How near the log comes to the goal.
+
+    Attributes:
+        share: Share of the logged states within a quarter of a spread of it, in each direction that the cost weighs.
+        outside: Whether the goal is farther from the logged states than 99 % of them are from each other.
+    """
+
+    share: float
+    outside: bool
+
+    @property
+    def missed(self) -> bool:
+        """Whether the log says nothing of the goal."""
+        return self.outside and self.share < _SCARCE
+
+
 def returns_of(value: ValueFunction, table: TransitionTable, discount: float) -> tuple[Array, Array]:
-    """V and the measured return of states of the last tenth of the episodes (200 at most), ``(n,)`` each.
+    """V and the measured return of states of the last tenth of the episodes (200 at most), ``(n,)`` each."""
+    observations, returns, _ = _measured(table, discount)
+    return value.predict(observations), returns
+
+
+def _measured(table: TransitionTable, discount: float) -> tuple[Array, Array, Array]:
+    """States of the last tenth of the episodes, the return measured from each, and the number of its episode.
 
     Only where nearly all of a discounted return lies within its episode.
 
     Args:
-        value: V_phi.
         table: The transitions.
         discount: gamma.
     """
     needed = int(np.ceil(np.log(_TAIL) / np.log(discount))) if discount < 1.0 else len(table)
     episodes, n_episodes = table.episodes, table.n_episodes
-    observations, returns = [], []
+    observations, returns, numbers = [], [], []
     for k in range(n_episodes - min(max(1, n_episodes // 10), _MOST_EPISODES), n_episodes):
         episode = table.take(episodes.rows(k))
         costs, ended = episode.costs.astype(np.float64), episode.terminations[-1] > 0.0
@@ -107,17 +142,40 @@ def returns_of(value: ValueFunction, table: TransitionTable, discount: float) ->
         complete = len(episode) if ended else max(0, len(episode) - needed)
         observations.append(episode.observations[:complete])
         returns.append(total[:complete])
-    return value.predict(np.concatenate(observations)), np.concatenate(returns)
+        numbers.append(np.full(complete, k))
+    return np.concatenate(observations), np.concatenate(returns), np.concatenate(numbers)
 
 
 def value_check(value: ValueFunction, table: TransitionTable, discount: float) -> ValueCheck:
     """V against measured returns; see :func:`returns_of`."""
-    predicted, measured = returns_of(value, table, discount)
+    observations, measured, episodes = _measured(table, discount)
+    predicted = value.predict(observations)
     if len(measured) < 10 or measured.std() == 0.0:
-        return ValueCheck(0, np.nan, np.nan, np.nan)
+        return ValueCheck(0, np.nan, np.nan, np.nan, np.nan)
     difference = (predicted - measured) / measured.std()
-    correlation = scipy.stats.spearmanr(predicted, measured).statistic
-    return ValueCheck(len(measured), float(correlation), float(difference.mean()), float(np.mean(difference > 1.0)))
+    return ValueCheck(
+        len(measured),
+        _correlation(predicted, measured),
+        float(difference.mean()),
+        float(np.mean(difference > 1.0)),
+        _attainable(observations.astype(np.float64), measured, episodes),
+    )
+
+
+def _correlation(first: Array, second: Array) -> float:
+    """Spearman's; 0 where one of them does not vary."""
+    varied = np.ptp(first) > 0.0 and np.ptp(second) > 0.0
+    return float(scipy.stats.spearmanr(first, second).statistic) if varied else 0.0
+
+
+def _attainable(states: Array, returns: Array, episodes: Array) -> float:
+    """Correlation of returns with a regression on the state, quadratic with random features, of other episodes."""
+    later = episodes >= np.median(episodes)
+    if later.all() or not later.any():
+        return 0.0
+    features = RandomFeatures(states[~later], min(_LAG_FEATURES, int(np.sum(~later)) // 10), np.random.default_rng(0))
+    regression = Ridge.fit(features(states[~later]), returns[~later, None] - returns[~later].mean())
+    return _correlation(regression(features(states[later]))[:, 0], returns[later])
 
 
 def fit_errors(
@@ -242,10 +300,47 @@ def lag_check(identified: MPC, table: TransitionTable) -> LagCheck:
     return LagCheck(share, float(scipy.stats.f(past.shape[1], degrees).sf(statistic)))
 
 
-def goal_share(table: TransitionTable, reference: Array) -> float:
-    """Share of the logged states within a quarter of the data's spread of the reference, in every coordinate."""
-    states = table.observations[:, : len(reference)]
-    return float(np.mean((np.abs(states - reference) < _NEAR * spread_of(states)).all(axis=1)))
+def goal_check(mpc: MPC, table: TransitionTable) -> GoalCheck | None:
+    """Whether the log comes near the goal: where nothing that the stage cost weighs is off; None without a goal.
+
+    Only directions in which the cost has a weight count, in spreads of what it weighs::
+
+        e = z - x_ref, of what tracks a signal its distance from it,     |D W D| along a direction > 0,  D = diag(std e)
+
+    Args:
+        mpc: MPC_1, whose costs say where the goal is.
+        table: The transitions of its states.
+    """
+    errors = _goal_errors(mpc, table.sample(2 * _TREE_ROWS, 5).observations.astype(np.float64))
+    if errors is None or not errors.shape[1]:
+        return None
+    near = (np.abs(errors) < _NEAR).all(axis=1)
+    order = np.random.default_rng(0).permutation(len(errors))
+    half = max(1, len(errors) // 2)
+    tree = scipy.spatial.cKDTree(errors[order[:half]])
+    others = np.atleast_1d(tree.query(errors[order[half:]])[0])
+    away = float(tree.query(np.zeros(errors.shape[1]))[0])
+    return GoalCheck(float(near.mean()), bool(len(others)) and away > float(np.quantile(others, 0.99)))
+
+
+def _goal_errors(mpc: MPC, states: Array) -> Array | None:
+    """What is off in each weighed direction, in spreads, ``(n, k)``."""
+    reference, cost = mpc.reference, mpc.stage_cost
+    if reference is None:
+        return None
+    weight = cost.W if type(cost) is QuadraticCost else None  # in features of the state, every state counts
+    target = reference if weight is None else mpc.values["stage_cost.x_ref"]
+    states, at = states.copy(), dict(zip((s.name for s in mpc.layout.signals), mpc.layout.present, strict=True))
+    tracks: dict[int, str] = getattr(cost, "tracks", None) or {}
+    for i, name in tracks.items():
+        states[:, i] -= states[:, at[name]]
+    errors = states[:, : len(target)] - target
+    spread = spread_of(errors)
+    if weight is None:
+        return np.asarray(errors / spread)
+    weights, directions = np.linalg.eigh(spread[:, None] * weight * spread)
+    along = (errors / spread) @ directions[:, weights > _WEIGHED * weights.max(initial=0.0)]
+    return np.asarray(along / spread_of(along))
 
 
 def bound_names(mpc: MPC, nominal: MPC, table: TransitionTable) -> tuple[str, ...]:

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpcoffline.core.archive import plain
+from mpcoffline.core.text import listed
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.plotting import save_figure
 
 from .figure import Traces, draw
-from .measures import LagCheck, RegionError, ValueCheck
+from .measures import GoalCheck, LagCheck, RegionError, ValueCheck
 from .stability import TheoremCheck, WeightCheck
 from .verdict import Comparison, Verdict
 
@@ -63,7 +64,7 @@ class Report:
         outside_support: Share of f_theta(s, a), over the logged (s, a), outside the data's support.
         lag: Whether inputs act late.
         noise: Measurement and process noise.
-        goal_share: Share of the logged states near the reference; None without reference.
+        goal: How near the log comes to the goal; None without one.
         failed_solves: Share of the simulations' MPCs that were not solved at first: MPC_1's, the learned MPC's.
         findings: What the fit found beside the parameters; see :attr:`mpcoffline.OfflineMPCLearner.findings`.
         n_rows: Transitions.
@@ -84,7 +85,7 @@ class Report:
     outside_support: float
     lag: LagCheck
     noise: NoiseEstimate
-    goal_share: float | None
+    goal: GoalCheck | None
     failed_solves: tuple[float, float]
     findings: tuple[str, ...]
     n_rows: int
@@ -113,10 +114,10 @@ class Report:
             ("closed-loop eigenvalues", _numbers(self.theorem.eigenvalues) or "unknown"),
             *((f"eigenvalues of {w.name}", f"{_numbers(w.before)} before, {_numbers(w.after)} after")
               for w in self.weights),
-            ("parameters at bounds", ", ".join(self.at_bounds) or "none"),
+            ("parameters at bounds", listed(self.at_bounds) or "none"),
             ("measurement noise", f"{self.noise.level:.1%} of the states' spread ({self.noise.source})"),
             ("effect of past inputs", f"{self.lag.share:.1%} of the present one's"),
-            ("logged states near the goal", "unknown" if self.goal_share is None else f"{self.goal_share:.2%}"),
+            ("logged states near the goal", "unknown" if self.goal is None else f"{self.goal.share:.2%}"),
         ]  # fmt: skip
         width = max(len(name) for name, _ in rows)
         return "\n".join([*lines, "Figures", *(f"  {name:<{width}}  {text}" for name, text in rows)])

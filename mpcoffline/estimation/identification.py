@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidDataError
+from mpcoffline.core.text import listed
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
@@ -107,10 +108,11 @@ class OneStepIdentification:
     def warn(self) -> None:
         """Logs what the user should know."""
         if self.undetermined:
-            text = "The data do not determine %s; kept near the given values."
-            logger.warning(text, ", nor ".join(self.undetermined))
+            text = "The data do not determine %s; what they leave open stays near the given values."
+            logger.warning(text, listed(self.undetermined, joint=", nor "))
         if self.at_bound:
-            logger.warning("Identified at a bound: %s. Is the bound right, and the model's structure?", self.at_bound)
+            text = "Identified at a bound: %s. Is the bound right, and the model's structure?"
+            logger.warning(text, listed(self.at_bound))
         if self.unwrapped:
             logger.warning("Wrapped angles (compared modulo 2 pi): coordinates %s.", list(self.unwrapped))
         if self.absurd[0]:

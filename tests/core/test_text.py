@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given, strategies as st
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.core.text import c_comment, c_identifiers, check_name, check_unit, markdown, markdown_code, visible
+from mpcoffline.core.text import (
+    c_comment,
+    c_identifiers,
+    check_name,
+    check_unit,
+    listed,
+    markdown,
+    markdown_code,
+    visible,
+)
 
 names = st.text(st.sampled_from("abgφö²ß_.-^*/()%°µ·[], 019Ω日"), min_size=1, max_size=12).filter(str.strip)
 
@@ -100,3 +109,9 @@ def test_thousands_of_names_that_look_alike_take_no_time() -> None:
     found = c_identifiers("+" * (k // 10 % 99 + 1) + "-" * (k % 10) + "/" * (k // 990) for k in range(9_900))
     assert len(set(found.values())) == 9_900
     assert time.process_time() - start < 2.0
+
+
+def test_of_many_names_some_are_told() -> None:
+    assert listed(()) == ""
+    assert listed(["a", "b"]) == "a, b"
+    assert listed([f"p{i}" for i in range(40)], 3, joint=", nor ") == "p0, nor p1, nor p2 and 37 more"

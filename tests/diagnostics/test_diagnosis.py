@@ -45,8 +45,8 @@ def test_a_fit_that_repairs_a_wrong_model_is_recommended(good: Report) -> None:
     assert good.noise.negligible
     assert not good.lag.found
     assert good.at_bounds == ()
-    assert good.goal_share is not None
-    assert good.goal_share > 0.01
+    assert good.goal is not None
+    assert good.goal.share > 0.01
     assert (good.n_rows, good.n_episodes) == (1_600, 40)
 
 

@@ -16,7 +16,7 @@ from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.diagnostics.measures import (
     bound_names,
     fit_errors,
-    goal_share,
+    goal_check,
     lag_check,
     one_step_error,
     outside_support,
@@ -236,8 +236,16 @@ def test_a_late_input_is_found_and_a_wrong_structure_is_not_taken_for_one() -> N
 
 
 def test_whether_the_log_reaches_the_goal() -> None:
-    assert goal_share(LOG, np.zeros(2)) > 0.01
-    assert goal_share(LOG, np.array([30.0, 0.0])) == 0.0
+    near, far = (
+        goal_check(lq_plant.make_mpc(stage_cost=QuadraticCost(lq_plant.W, lq_plant.R, x_ref=x)), LOG)
+        for x in ([0.0, 0.0], [30.0, 0.0])
+    )
+    assert near is not None
+    assert far is not None
+    assert near.share > 0.01
+    assert not near.missed
+    assert far.share == 0.0
+    assert far.missed
     np.testing.assert_array_equal(lq_plant.make_mpc().reference, [0.0, 0.0])
 
 
@@ -278,6 +286,8 @@ def test_growth_of_v_and_weights() -> None:
     assert value_growth(value, LOG, inside, lost=False) == pytest.approx(1.0, abs=0.1)
     assert value_growth(value, LOG, 10.0 * inside, lost=False) > 50.0
     assert value_growth(value, LOG, inside, lost=True) == np.inf
-    W, R = weight_checks(TRUE_MPC, lq_plant.make_mpc(W=np.diag([5.0, 2.0])))
-    assert (W.before, W.after) == (pytest.approx((0.1, 1.0)), pytest.approx((2.0, 5.0)))
-    assert R.before == R.after == pytest.approx((0.1,))
+    W, R = weight_checks(TRUE_MPC, lq_plant.make_mpc(W=np.diag([5.0, 2.0])), LOG)
+    first, second = LOG.observations.var(axis=0)  # weights are in spreads of what they weigh
+    assert W.before == pytest.approx(sorted((first, 0.1 * second)), rel=1e-5)
+    assert W.after == pytest.approx(sorted((5.0 * first, 2.0 * second)), rel=1e-5)
+    assert R.before == R.after == pytest.approx((0.1 * LOG.actions.var(),), rel=1e-5)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.core.text import listed
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning.stages import FitResult, KnownCost, Metrics
@@ -232,7 +233,7 @@ class ParameterTraining:
         )
         at_bounds = tuple(self._coordinates.at_bounds(refit.theta))
         if at_bounds:
-            _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", ", ".join(at_bounds))
+            _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", listed(at_bounds))
         return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
