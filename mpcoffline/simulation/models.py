@@ -12,7 +12,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residuals
 from mpcoffline.estimation.identification import FULL_TURN, OneStepIdentification, OneStepProblem, Rows, without_jumps
 from mpcoffline.estimation.multi_step import Windows
-from mpcoffline.estimation.plant import plant_rows
+from mpcoffline.estimation.plant import plant_rows, state_rows
 from mpcoffline.estimation.smoothing import excerpt
 from mpcoffline.estimation.structure import HeldOut
 from mpcoffline.estimation.trajectories import Trajectories
@@ -91,23 +91,24 @@ class LogModels:
         Raises:
             InvalidDataError: If the data have other dimensions than the MPC.
         """
-        rows, rng = excerpt(plant_rows(mpc, table), seed), np.random.default_rng(seed)
-        held_out = HeldOut.of(rows.episode_ids, seed).rows
+        states, rng = excerpt(state_rows(mpc, table), seed), np.random.default_rng(seed)
+        rows, held_out = plant_rows(mpc, states), HeldOut.of(states.episode_ids, seed).rows
         used = rows.take(np.flatnonzero(~held_out))
         problem, unwrapped = _problem(mpc, used)
         thetas = [mpc.theta, *moved_parameters(problem, used, n_perturbed, rng)]
-        residuals = [each for each in fit_residuals(mpc, used, seed, count=n_residual) if each.network is not None]
+        residuals = fit_residuals(mpc, states.take(np.flatnonzero(~held_out)), seed, count=n_residual)
+        networks = [each for each in residuals if each.network is not None]
         names = ["identified" if found is not None else "given", *(f"moved {i}" for i in range(1, len(thetas)))]
-        names += [f"residual {i}" for i in range(1, len(residuals) + 1)]
-        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(residuals)]), residuals)
+        names += [f"residual {i}" for i in range(1, len(networks) + 1)]
+        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(networks)]), networks)
         errors, baseline = _judged(mpc, members, rows, held_out, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
         if known is not None and not known.negligible:
             noise = np.asarray(known.measurement, dtype=np.float64)
         angles = np.array(unwrapped, dtype=np.intp)
-        states = rows.observations[:, angles].astype(np.float64)
-        middle = (states.min(axis=0) + states.max(axis=0)) / 2.0
+        turning = rows.observations[:, angles].astype(np.float64)
+        middle = (turning.min(axis=0) + turning.max(axis=0)) / 2.0
         return cls(
             tuple(names), errors, baseline, noise, members, mpc.layout, (angles, np.asarray(middle) - FULL_TURN / 2.0)
         )

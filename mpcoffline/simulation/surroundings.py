@@ -17,7 +17,7 @@ from .models import LogModels
 from .trials import Surroundings
 
 _MOST_STEPS = 400
-_ENOUGH = 16  # episodes, from which on all start where one of the log did
+_HORIZONS = 2  # that an episode has at least: a log of shorter ones tells little of where a loop ends
 
 
 def surroundings_of(
@@ -40,7 +40,7 @@ def surroundings_of(
         table: The transitions as they were logged.
         found: What was identified.
         n_starts: Number of episodes on each model.
-        n_steps: Their length; that of the longest logged one by default.
+        n_steps: Their length; by default that of the longest logged one, but two horizons at least.
         most_steps: What that is at most.
         most_models: Take no more than the best of so many, beside the identified one.
         seed: Of models, starts and noise.
@@ -58,9 +58,10 @@ def surroundings_of(
     models = LogModels.of(identified, clean, found, seed=seed).asked(most_models)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
-    if _ENOUGH <= clean.n_episodes < n_starts:  # others than these begin nearer to where a controller rests
-        n_starts = clean.n_episodes
+    n_starts = min(
+        n_starts, max(n_starts // 2, 2 * clean.n_episodes)
+    )  # half of them where an episode began, if it can be
     rows = initial_rows(clean, n_starts, seed)
     rows = np.random.default_rng([seed, 1]).permutation(rows)  # those that judge are like those that choose
-    n_steps = n_steps or min(most_steps, int(table.episodes.lengths.max()))
+    n_steps = n_steps or min(most_steps, max(int(table.episodes.lengths.max()), _HORIZONS * mpc.horizon))
     return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)

@@ -27,6 +27,7 @@ _ARRAYS = {
     "lost": "b",
     "rows": "i",
     "returns": "f",
+    "begun": "b",
     "judged": "b",
     "n_steps": "i",
 }
@@ -54,6 +55,7 @@ class Trials:
         lost: Whether the state ran away, or the episode ended as bad ones do.
         rows: The row of the log that each start is, ``(starts,)``.
         returns: What the log itself cost from there over as many steps, ``(starts,)``; NaN where it ends before.
+        begun: The starts at which an episode of the log began, ``(starts,)``: they tell what an episode costs.
         judged: The starts that had no part in the choice among the controllers, ``(starts,)``.
         n_steps: Length of an episode.
     """
@@ -66,6 +68,7 @@ class Trials:
     lost: NDArray[np.bool_]
     rows: NDArray[np.intp]
     returns: Array
+    begun: NDArray[np.bool_]
     judged: NDArray[np.bool_]
     n_steps: int
 
@@ -75,7 +78,7 @@ class Trials:
         shape = len(names), len(around.models), len(around.rows)
         cost, second, lost = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
         models, rows, returns = around.models, around.rows, around.returns
-        parts = cost, second, lost, rows, returns, judged, around.n_steps
+        parts = cost, second, lost, rows, returns, around.begun, judged, around.n_steps
         return cls(tuple(names), models.names, models.votes, *parts)
 
     def fill(self, name: str, around: Surroundings, controller: Controller, starts: slice) -> Episodes:
@@ -120,7 +123,7 @@ class Trials:
         """
         n = np.size(arrays.get("rows", ()))
         shapes: dict[str, tuple[int, ...]] = {name: (len(names), len(models), n) for name in ("cost", "second", "lost")}
-        shapes |= {"votes": (len(models),), "n_steps": ()} | dict.fromkeys(("rows", "returns", "judged"), (n,))
+        shapes |= {"votes": (len(models),), "n_steps": ()} | dict.fromkeys(("rows", "returns", "begun", "judged"), (n,))
         for name, kind in _ARRAYS.items():
             array = arrays.get(name)
             if array is None or array.shape != shapes[name] or array.dtype.kind != kind:
@@ -180,6 +183,7 @@ class Surroundings:
         rng = np.random.default_rng([seed, _NOISE])
         self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
         self.returns = returns_along(table, rows, n_steps)
+        self.begun = np.isin(rows, table.episodes.firsts)
         states = columns.observations
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
