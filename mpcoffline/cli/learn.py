@@ -84,6 +84,13 @@ def learn(
         int | None, typer.Option(help="Gradient steps of (VALUE).", show_default="the preset's", min=1)
     ] = None,
     alpha: Alpha = 1.0,
+    candidate: Annotated[
+        str,
+        typer.Option(
+            help="auto: the best candidate on models of the data, which takes closed loops; full: the whole fit as it "
+            "is; or another candidate by name."
+        ),
+    ] = "auto",
     seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="Where to save the learner.", dir_okay=False)] = Path("learner.zip"),
     checkpoint: Annotated[
@@ -98,7 +105,8 @@ def learn(
 ) -> None:
     """Learn the parameters of a task's MPC from a data set.
 
-    Saves the learner and, beside it, its policy (learner.zip, learner_policy.zip). No MPC is solved while learning.
+    Saves the learner and, beside it, its policy (learner.zip, learner_policy.zip). No MPC is solved while learning; the
+    choice among what was learned and MPC_1, which comes last, simulates them in closed loop.
     """
     from mpcoffline.learner.learner import OfflineMPCLearner
 
@@ -116,6 +124,7 @@ def learn(
         preset.value,
         seed,
         value=value,
+        candidate=candidate,
         **{name: number for name, number in overrides.items() if number is not None},
     )
     begin = time.perf_counter()
@@ -134,6 +143,8 @@ def learn(
     console.print(_parameter_table(learner))
     for finding in learner.findings:
         say(escape(finding))
+    if learner.candidates is not None:
+        say(escape(str(learner.candidates)))
     say_file("Learner", out)
     say_file("Policy", policy_file)
     env_id = data.spec.env_spec.id if data.spec.env_spec is not None else "ENV_ID"
@@ -219,6 +230,8 @@ def _data_and_mpc(task: Task | None, dataset: str | None, alpha: float, seed: in
 
 def _described(learner: OfflineMPCLearner, data: MinariDataset) -> dict[str, Any]:
     """What a learner is, for machines."""
+    from mpcoffline.learner.candidates import FULL
+
     fitted = learner.result
     return {
         "dataset": str(data.spec.dataset_id),
@@ -232,6 +245,7 @@ def _described(learner: OfflineMPCLearner, data: MinariDataset) -> dict[str, Any
         "loss_before": None if fitted is None else fitted.loss_before,
         "loss_after": None if fitted is None else fitted.loss_after,
         "findings": list(learner.findings),
+        "candidate": FULL if learner.candidates is None else learner.candidates.chosen,
         "nominal": learner.nominal_mpc.values,
         "learned": learner.mpc.values,
         "history": [{"epoch": epoch} | metrics for epoch, metrics in learner.history],

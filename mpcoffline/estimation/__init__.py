@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .delays import DelaySearch, find_delays
+from .episodes import EpisodeSpread
 from .identification import IdentificationConfig
 from .identifying import Identification, identify
 from .residual import Residual, fit_residual, fit_residuals, with_residual
@@ -11,6 +12,7 @@ from .structure import MultiStepCheck
 
 __all__ = [
     "DelaySearch",
+    "EpisodeSpread",
     "Identification",
     "IdentificationConfig",
     "MultiStepCheck",

@@ -154,6 +154,7 @@ class OneStepProblem:
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
         self.names = [names[i] for i in self.free]
+        self.varying = mpc.space.varying[c.mask][self.free]
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""
@@ -162,9 +163,9 @@ class OneStepProblem:
         return other
 
     def theta(self, z: Array) -> Array:
-        """The full theta of free coordinates z."""
-        full = np.zeros(self.coordinates.size)
-        full[self.free] = z
+        """The full theta ``(..., size)`` of free coordinates z ``(..., p)``."""
+        full = np.zeros((*z.shape[:-1], self.coordinates.size))
+        full[..., self.free] = z
         return np.asarray(self.coordinates.theta(torch.from_numpy(full)).numpy())
 
     def z(self, theta: Array) -> Array:
@@ -174,8 +175,8 @@ class OneStepProblem:
     def slopes(self, z: Array) -> Array:
         """The derivative of theta in z, of the free coordinates."""
         c = self.coordinates
-        slopes = np.where(c.logarithmic, self.theta(z)[c.mask], c.scale)
-        return np.asarray(slopes[self.free])
+        slopes = np.where(c.logarithmic, self.theta(z)[..., c.mask], c.scale)
+        return np.asarray(slopes[..., self.free])
 
     def errors(self, theta: Array) -> Array:
         """Normalised prediction errors, ``(n, nx)``; not finite where the model is not."""
@@ -185,11 +186,12 @@ class OneStepProblem:
     def linearised(self, z: Array) -> tuple[Array, Array]:
         """The errors and their derivative in z, ``(n, nx)`` and ``(n, nx, p)``; a prediction that fails is a wall.
 
+        z is one ``(p,)`` for all rows, or one a row ``(n, p)``.
         Errors e beyond c = 1000 count c (1 + log(e / c)): a few absurd ones do not decide what the model is.
         """
         predicted, slopes = self.model.with_slopes(self.rows.x, self.rows.u, self.theta(z))
         errors = (predicted - self.rows.reached) / self.scale
-        jacobian = slopes[:, :, self.free] * self.slopes(z) / self.scale[:, None]
+        jacobian = slopes[:, :, self.free] * self.slopes(z)[..., None, :] / self.scale[:, None]
         finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
         errors, jacobian = np.where(finite, errors, ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
         beyond = np.maximum(np.abs(errors) / ABSURD, 1.0)

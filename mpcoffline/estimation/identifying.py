@@ -14,6 +14,7 @@ from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC, Model
 
+from .episodes import EpisodeSpread, by_episode
 from .identification import (
     IdentificationConfig,
     OneStepIdentification,
@@ -53,6 +54,8 @@ class Identification(OneStepIdentification):
         table: The smoothed data; the given table itself where its noise is negligible.
         noise: The noise found.
         model: The identified model, integrated as accurately as the log asks for.
+        episode_spread: The parameters with ``varies="episode"`` of each episode, their mean, which theta has, and their
+            covariance; None where the model has none.
         multi_step: How well the model predicts many steps, and whether other parameters would do so better, which says
             that its structure is wrong; None where the log has no stretches long enough.
     """
@@ -60,6 +63,7 @@ class Identification(OneStepIdentification):
     table: TransitionTable
     noise: NoiseEstimate
     model: Model
+    episode_spread: EpisodeSpread | None = None
     multi_step: MultiStepCheck | None = None
 
 
@@ -89,6 +93,9 @@ def identify(
     With ``horizon``, the parameters that predict so many steps open loop best, from starts that are fitted, too (output
     error, :class:`~mpcoffline.estimation.multi_step.MultiStepProblem`). With the right structure that gains nothing;
     with a wrong one it predicts farther, and controllers on it were no better.
+
+    Parameters with ``varies="episode"`` are found for each episode from there on, with one-step errors
+    (:func:`~mpcoffline.estimation.episodes.by_episode`); theta has their mean.
 
     Example:
         >>> found = mpcoffline.estimation.identify(mpc, table)
@@ -124,6 +131,8 @@ def identify(
         logger.info("Identified again: at what was found, %s is not accurate, %s is.", found.model.scheme, model.scheme)
         mpc = mpc.replace(model=model.with_theta(mpc.model.space.theta))
     found.warn()
+    if found.episode_spread is not None:
+        logger.info("%s", found.episode_spread)
     check = _checked(mpc, rows, found, config, seed)
     if check is not None:
         substeps = () if found.model.integrator != "auto" else (f"the integrator ({found.model.scheme} is accurate)",)
@@ -148,8 +157,11 @@ def _identified(
     """As :func:`identify`, from a table of :func:`plant_rows`, with the model integrated as it is."""
 
     def result(found: OneStepIdentification, table: TransitionTable, noise: NoiseEstimate) -> Identification:
+        spread = None
+        if mpc.space.varying.any():
+            found, spread = _by_episode(mpc, table, found, config, seed)
         model = mpc.with_theta(found.theta).model
-        return Identification(**vars(found), table=table, noise=noise, model=model)
+        return Identification(**vars(found), table=table, noise=noise, model=model, episode_spread=spread)
 
     first = identify_plant(mpc, table, config, seed=seed)
     source = excerpt(table, seed)
@@ -170,6 +182,20 @@ def _identified(
     rows = Trajectories.of(mpc, excerpt(clean, seed), first.unwrapped).rows()
     problem = OneStepProblem(mpc, rows, centre, noisy.coordinates)
     return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), clean, noise)
+
+
+def _by_episode(
+    mpc: MPC, table: TransitionTable, found: OneStepIdentification, config: IdentificationConfig, seed: int
+) -> tuple[OneStepIdentification, EpisodeSpread | None]:
+    """What was identified with the mean of what varies from episode to episode, and its spread."""
+    source = excerpt(table, seed)
+    few = Trajectories.of(mpc, source, found.unwrapped).thinned(FEW_ROWS, seed)
+    problem = OneStepProblem(mpc, few.rows(), table.centring.centre[: table.ny])
+    if not problem.varying.any():  # fixed by their bounds
+        return found, None
+    ids = source.episode_ids[few.index[few.valid]]
+    z, misfit, spread = by_episode(problem, problem.z(found.theta), ids, config.prior_spread)
+    return described(mpc, problem, z, misfit, config.prior_spread, found.unwrapped), spread
 
 
 def _predicting_far(

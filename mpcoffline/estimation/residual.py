@@ -21,7 +21,7 @@ from mpcoffline.mpc import MPC
 from .identification import OneStepProblem, Rows, without_jumps
 from .multi_step import Windows, open_loop
 from .plant import plant_rows
-from .small_network import SmallNetwork, fit_small_network
+from .small_network import Effort, SmallNetwork, fit_small_network
 from .structure import HeldOut, clearly_negative
 from .trajectories import Trajectories
 
@@ -34,6 +34,7 @@ _ROWS = 20_000
 _LEAST = 1e-3  # of an increment: what is missed by less is not worth a network
 _FEW = 4  # episodes, below which windows are compared
 _ABSURD = 1e3
+_DRAWN, _STEPS = 1_000, 40  # rows of a step, and steps, of a network that is one of several
 
 
 @dataclass(frozen=True)
@@ -154,11 +155,13 @@ def fit_residuals(mpc: MPC, table: TransitionTable, seed: int = 0, *, count: int
     ids, group = np.unique(missed.episodes, return_inverse=True)
     if len(ids) < _FEW:
         group = np.arange(len(group)) * 20 // len(group)
-    found = []
+    effort, found = Effort(rows=_DRAWN, steps=_STEPS), list[Residual]()
     for _ in range(count):
         drawn = rng.integers(group.max() + 1, size=group.max() + 1)
         rows = np.concatenate([np.flatnonzero(group == k) for k in drawn])
-        found.append(missed.at(rows).learned(np.ones(len(rows), dtype=bool), outputs, rng))
+        found.append(missed.at(rows).learned(np.ones(len(rows), dtype=bool), outputs, rng, effort))
+        if (network := found[0].network) is not None:
+            effort = effort._replace(decays=(network.decay,))  # the next ones would choose the same
     return tuple(found)
 
 
@@ -191,12 +194,18 @@ class _Missed:
         """Some of the rows."""
         return _Missed(self.inputs[rows], self.errors[rows], self.episodes[rows], self.unit)
 
-    def learned(self, rows: NDArray[np.bool_], outputs: NDArray[np.bool_], rng: np.random.Generator) -> Residual:
+    def learned(
+        self,
+        rows: NDArray[np.bool_],
+        outputs: NDArray[np.bool_],
+        rng: np.random.Generator,
+        effort: Effort | None = None,
+    ) -> Residual:
         """The network of some of the rows; a quarter of their episodes says when to stop."""
         stop = HeldOut.of(self.episodes[rows], int(rng.integers(2**31))).rows
         inputs, errors = self.inputs[rows], self.errors[rows][:, outputs]
         parts = ((inputs[part], errors[part]) for part in (~stop, stop))
-        return Residual(fit_small_network(next(parts), next(parts), HIDDEN, rng), outputs, self.unit)
+        return Residual(fit_small_network(next(parts), next(parts), HIDDEN, rng, effort), outputs, self.unit)
 
     def gains(self, residual: Residual, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which states are predicted better on these rows, beyond chance, ``(nx,)``."""

@@ -17,16 +17,28 @@ _FLATTEST = 0.05  # variance of the flattest direction, in spreads: data of a co
 _REACH = 1.25  # times the largest target: the bound of an output
 _DAMPING = (1e-2, 1e-7, 1e8)  # at first, least, most
 _ATTEMPTS = 8
-_DECAYS = (1e-2, 1e-3, 1e-4)  # of the targets' mean square, a weight squared; less only where it is worth it
 _WORTH = 0.95  # times the error on the data held out
-_BATCH = 1_500
-_STEPS = 60
 _PATIENCE = 12  # steps without a smaller error on the data held out
 _NARROW = 0.1  # of the size that random_layers gives to the output layer: the first guess is next to nothing
 
 
 Layers = tuple[list[Array], list[Array]]  # weights and biases
 Rows = tuple[Array, Array, Array]  # inputs, unit of each output, targets
+
+
+class Effort(NamedTuple):
+    """How a network is fitted.
+
+    Attributes:
+        rows: Number of rows that a step looks at.
+        steps: Most of them.
+        decays: How much weights are pulled towards zero: of the targets' mean square, a weight squared. The first, and
+            each next one where it is worth it.
+    """
+
+    rows: int = 1_500
+    steps: int = 60
+    decays: tuple[float, ...] = (1e-2, 1e-3, 1e-4)
 
 
 class Gate(NamedTuple):
@@ -69,12 +81,14 @@ class SmallNetwork:
         weights: A_0, A_1, A_2.
         biases: b_0, b_1, b_2.
         limit: Bound of each output, ``(m,)``.
+        decay: How much its weights were pulled towards zero.
     """
 
     gate: Gate
     weights: tuple[Array, ...]
     biases: tuple[Array, ...]
     limit: Array
+    decay: float = 0.0
 
     def __call__(self, data: Array) -> Array:
         """The outputs ``(rows, m)`` at inputs ``(rows, n)``."""
@@ -92,7 +106,11 @@ class SmallNetwork:
 
 
 def fit_small_network(
-    data: tuple[Array, Array], stop: tuple[Array, Array], hidden: tuple[int, int], rng: np.random.Generator
+    data: tuple[Array, Array],
+    stop: tuple[Array, Array],
+    hidden: tuple[int, int],
+    rng: np.random.Generator,
+    effort: Effort | None = None,
 ) -> SmallNetwork:
     """The network nearest to targets in mean square, by Levenberg and Marquardt (doi:10.1137/0111030).
 
@@ -104,24 +122,36 @@ def fit_small_network(
         stop: Rows held out.
         hidden: Widths.
         rng: Draws weights and rows.
+        effort: Rows, steps, and the pulls that are tried.
     """
+    effort = effort or Effort()
     gate = Gate.of(data[0])
     limit = np.maximum(_REACH * np.abs(data[1]).max(axis=0), np.finfo(np.float64).tiny)
     (z, open_), (z_stop, open_stop) = (gate.standardised(part[0]) for part in (data, stop))
     sizes, draw = (z.shape[1], *hidden, data[1].shape[1]), int(rng.integers(2**31))
     batches, size = (z, open_[:, None] * limit, data[1]), float(np.mean(data[1] ** 2))
     held_out = z_stop, open_stop[:, None] * limit, stop[1]
-    best, error = _descended(sizes, batches, held_out, _DECAYS[0] * size, np.random.default_rng(draw))
-    for decay in _DECAYS[1:]:
-        other, smaller = _descended(sizes, batches, held_out, decay * size, np.random.default_rng(draw))
+
+    def descended(decay: float) -> tuple[Layers, float]:
+        return _descended(sizes, batches, held_out, decay * size, np.random.default_rng(draw), effort)
+
+    chosen = effort.decays[0]
+    best, error = descended(chosen)
+    for decay in effort.decays[1:]:
+        other, smaller = descended(decay)
         if not smaller < _WORTH * error:
             break
-        best, error = other, smaller
-    return SmallNetwork(gate, tuple(best[0]), tuple(best[1]), limit)
+        best, error, chosen = other, smaller, decay
+    return SmallNetwork(gate, tuple(best[0]), tuple(best[1]), limit, chosen)
 
 
 def _descended(
-    sizes: tuple[int, ...], data: Rows, held_out: Rows, decay: float, rng: np.random.Generator
+    sizes: tuple[int, ...],
+    data: Rows,
+    held_out: Rows,
+    decay: float,
+    rng: np.random.Generator,
+    effort: Effort,
 ) -> tuple[Layers, float]:
     """Weights and biases with the smallest error on the rows held out, and that error."""
     weights, biases = random_layers(sizes, rng)
@@ -130,8 +160,8 @@ def _descended(
     shapes = [part.shape for part in (*weights, *biases)]
     best, least_error, since = p, _error(_layers(p, shapes), *held_out), 0
     damping, least, most = _DAMPING
-    for _ in range(_STEPS):
-        rows = rng.permutation(len(data[0]))[:_BATCH]
+    for _ in range(effort.steps):
+        rows = rng.permutation(len(data[0]))[: effort.rows]
         batch = data[0][rows], data[1][rows], data[2][rows]
         curvature, slope, error = _normal_equations(_layers(p, shapes), *batch, len(p))
         slope -= decay * p

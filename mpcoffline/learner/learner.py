@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,7 +22,9 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
+from mpcoffline.simulation.choice import FIRST
 
+from .candidates import FULL, TRIALS, Candidates, tried
 from .checkpoint import Checkpoint, History, history_from_json
 from .findings import findings
 from .presets import PRESETS
@@ -68,6 +71,9 @@ class OfflineMPCLearner:
             recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
             longest.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
+        candidate: Which of the :attr:`candidates` is handed out. ``"auto"`` tries them on models of the log and takes
+            the best, MPC_1 where none is better; that solves MPCs, learning does not. ``"full"``, or another name,
+            takes that one and tries nothing. The paper's preset has no others than the whole fit.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
@@ -86,6 +92,9 @@ class OfflineMPCLearner:
     Attributes:
         method: The learning method with its options.
         preset: The name of the preset; None where a method was given.
+        candidate: As given.
+        candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
+            where the method knows of none but the whole fit.
     """
 
     def __init__(
@@ -95,6 +104,7 @@ class OfflineMPCLearner:
         preset: str = "default",
         seed: int = 0,
         *,
+        candidate: str = "auto",
         method: str | Method | None = None,
         value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
@@ -121,6 +131,8 @@ class OfflineMPCLearner:
             )
         self.method = method.replaced(options)
         self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
+        self.candidate = check_name("candidate", candidate)
+        self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
         self.history: History = []
@@ -144,9 +156,12 @@ class OfflineMPCLearner:
     def findings(self) -> tuple[str, ...]:
         """What the fit found of plant and costs beside the parameters, in sentences; none before ``fit``.
 
-        Whether the logged cost is the MPC's, dead time, integrator, learned residual.
+        Whether the logged cost is the MPC's, dead time, integrator, learned residual; which candidate is handed out.
         """
-        return findings(self.nominal_mpc, self._mpc, self.result) if isinstance(self._mpc, MPC) else ()
+        if not isinstance(self._mpc, MPC):
+            return ()
+        chosen = () if self.candidates is None else (self.candidates.finding,)
+        return (*findings(self.nominal_mpc, self._mpc, self.result), *chosen)
 
     def fit(
         self,
@@ -245,9 +260,23 @@ class OfflineMPCLearner:
                 bars.show(epoch.phase, epoch.step, epoch.n_steps, shown)
                 yield history[-1]
                 if any(_asks_to_end(answer) for answer in answers):
-                    self._mpc = self._found()  # which lets go of the data
-                    return
-            self._mpc = self._found()
+                    break
+            if run.learned is not None:
+                self.candidates = self._candidates(run, table, bars)
+                self._policy = None
+            self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
+
+    def _candidates(self, run: Run, table: TransitionTable, bars: Bars) -> Candidates | None:
+        """What could be handed out; None where that is the whole fit alone."""
+        known = run.known
+        between = {} if self.candidate == FULL else run.method.candidates(known)
+        if self.candidate == "auto":
+            show = partial(bars.show, "choosing on models of the log")
+            variants = partial(run.method.variants, known)
+            return tried(self.nominal_mpc, known, between, table, variants, show) if between else None
+        found = Candidates({FIRST: self.nominal_mpc, **between, FULL: known.mpc}, self.candidate)
+        _ = found.mpc  # refuses a name that is none of them
+        return None if self.candidate == FULL else found
 
     @property
     def mpc(self) -> MPC:
@@ -314,9 +343,13 @@ class OfflineMPCLearner:
             "device": self.device,
             "history": self.history,
             "result": None if self.result is None else self.result.to_json(),
+            "candidate": self.candidate,
+            "candidates": None if self.candidates is None else self.candidates.to_json(),
             "observation_space": None if space is None else box_to_json(space),
         }
         arrays = {} if self.value_function is None else self.value_function.to_arrays()
+        if self.candidates is not None:
+            arrays |= self.candidates.to_arrays()
         write_archive(path, "learner", document, arrays)
 
     @classmethod
@@ -338,10 +371,15 @@ class OfflineMPCLearner:
             learner.history = history_from_json(document["history"])
             if document["learned"] is not None:
                 learner._mpc = MPC.from_json(document["learned"])
+            learner.candidate = check_name("candidate", document["candidate"], error=FileFormatError)
+            if document["candidates"] is not None:
+                learner.candidates = Candidates.from_files(document["candidates"], arrays)
             if document["result"] is not None:
-                learner.result = FitResult.from_json(document["result"], learner.mpc.theta)
+                whole = learner.mpc if learner.candidates is None else learner.candidates[FULL]
+                learner.result = FitResult.from_json(document["result"], whole.theta)
             if document["observation_space"] is not None:
                 learner._observation_space = box_from_json(document["observation_space"])
+            arrays = {name: array for name, array in arrays.items() if not name.startswith(TRIALS)}
             if arrays:
                 learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
                 if document["value_given"]:

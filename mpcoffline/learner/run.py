@@ -120,6 +120,13 @@ class Run:
         return None if outcome is None else lambda: outcome().mpc
 
     @property
+    def known(self) -> Known:
+        """What is known at the end, once all is done."""
+        if self._outcome is None:
+            raise InvalidArgumentError("run", expected="one that is done", actual="one before its end")
+        return self._outcome()
+
+    @property
     def identity(self) -> str:
         """What decides the result (data, MPC, method, options, seed) as a SHA-256."""
         start = self._start

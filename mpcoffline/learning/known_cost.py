@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 _ROWS = 20_000
 _CHUNK = 100_000  # rows that are looked at a time
 _BLOCK = 1_000  # consecutive rows that are taken together
-_EXACT = 1e-6  # share of the variance that rounding may leave open
+ROUNDING = 1e-6  # share of the variance that rounding may leave open
 _NOISY = 0.05  # the same where noise in the states may be what is left
 _WHITE = 0.3  # correlation of neighbouring residuals above which these are no noise: wrong costs have .5 to .95
 _EXPLAINED = 0.3  # share of the residual's variance that a quadratic may explain: missing terms are explained whole
@@ -61,16 +61,16 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     if config.stage_cost == "fitted":
         return known
     rows = excerpt(known.table, known.seed)
-    found = known_cost(known.mpc, rows)
-    if found is None and config.stage_cost == "auto":
-        other = _with_fitted_weights(known.mpc, rows)
-        found = None if other is None else known_cost(other, rows, noise=False)
-        if other is None or found is None:
+    if config.stage_cost == "auto":
+        agreeing = agreeing_cost(known.mpc, rows)
+        if agreeing is None:
             return known
-        _log.info("The logged costs are the MPC's stage cost with other parameters, which are taken over")
-        return replace(known, mpc=other, cost=found)
-    if found is None:
-        found = _affine(*_costs(known.mpc, rows)[:2])
+        mpc, found = agreeing
+        if mpc is not known.mpc:
+            _log.info("The logged costs are the MPC's stage cost with other parameters, which are taken over")
+            return replace(known, mpc=mpc, cost=found)
+    else:
+        found = known_cost(known.mpc, rows) or _affine(*_costs(known.mpc, rows)[:2])
     _log.info("The stage cost is not learned but kept: %s", found)
     if found.agreeing < 1.0:
         _log.warning(
@@ -88,6 +88,24 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
             ", the model alone is learned" if "model" in known.groups else "",
         )
     return replace(known, cost=found)
+
+
+def agreeing_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | None:
+    """The MPC whose stage cost the logged costs are: the given one, or one with other weights; and the relation.
+
+    Args:
+        mpc: Its stage cost is Lhat.
+        table: Transitions as logged, see :func:`known_cost`.
+
+    Returns:
+        None where no weights make it so.
+    """
+    found = known_cost(mpc, table)
+    if found is not None:
+        return mpc, found
+    other = _with_fitted_weights(mpc, table)
+    found = None if other is None else known_cost(other, table, noise=False)
+    return None if other is None or found is None else (other, found)
 
 
 def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True) -> KnownCost | None:
@@ -111,8 +129,8 @@ def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True) -> Known
     if len(logged) < 3 or not np.isfinite(ours).all() or not ours.std() > 0.0:
         return None
     fit = _affine(ours, logged)
-    if fit.scale > 0.0 and fit.missed <= _EXACT:
-        return _rounded(fit, ours, logged, np.sqrt(_EXACT))
+    if fit.scale > 0.0 and fit.missed <= ROUNDING:
+        return _rounded(fit, ours, logged, np.sqrt(ROUNDING))
     if noise and fit.scale > 0.0 and fit.missed <= _NOISY:
         residual = logged - fit.scale * ours - fit.offset
         if _correlation(residual, pairs) <= _WHITE and _explained(inputs, residual) <= _EXPLAINED:
@@ -169,7 +187,7 @@ def _partly(ours: Array, logged: Array, inputs: Array) -> KnownCost | None:
         if np.mean(agree) < _AGREEING or (inputs[agree].std(axis=0) < _LEAST_SPREAD * inputs.std(axis=0)).any():
             return None
         kept, fit = np.flatnonzero(agree), _affine(ours[agree], logged[agree])
-    found = _rounded(fit, ours[kept], logged[kept], _EXACT)
+    found = _rounded(fit, ours[kept], logged[kept], ROUNDING)
     return replace(found, agreeing=float(np.mean(agree)), tolerance=tolerance)
 
 
@@ -201,7 +219,7 @@ def _rounded(fit: KnownCost, ours: Array, logged: Array, near: float) -> KnownCo
     """The relation with a scale of 1 where it is as near to that, and without an offset where that is rounding."""
     scale = 1.0 if abs(fit.scale - 1.0) <= near else fit.scale
     offset = float(np.mean(logged - scale * ours))
-    return replace(fit, scale=scale, offset=offset if abs(offset) > _EXACT * float(logged.std()) else 0.0)
+    return replace(fit, scale=scale, offset=offset if abs(offset) > ROUNDING * float(logged.std()) else 0.0)
 
 
 def _correlation(residual: Array, pairs: NDArray[np.intp]) -> float:
@@ -258,7 +276,7 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
     found = scipy.optimize.least_squares(
         residuals, np.clip(coordinates.start, low, high), jac=jacobian, bounds=(low, high), max_nfev=50, xtol=1e-12
     )
-    if not np.mean(found.fun**2) <= _EXACT:
+    if not np.mean(found.fun**2) <= ROUNDING:
         return None
     fitted = canonical(mpc, full(found.x))
     return mpc.with_theta(with_level(mpc, fitted, float(missed(fitted).mean())))

@@ -77,6 +77,24 @@ class Method(ABC):
         """What the stages begin with, found from all transitions; by default what is known already."""
         return known
 
+    def candidates(self, known: Known) -> dict[str, MPC]:
+        """MPCs that the fit knows by the way and that may do better than the whole of it; by default none.
+
+        Args:
+            known: What is known at the end of the fit.
+        """
+        return {}
+
+    def variants(self, known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
+        """What may be better than one of the candidates and is tried where that one is good; by default nothing.
+
+        Args:
+            known: What is known at the end of the fit.
+            name: The candidate's name.
+            mpc: The candidate.
+        """
+        return {}
+
     @property
     def name(self) -> str:
         """What it is called in calls and files.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation import Identification
 from mpcoffline.mpc import MPC
 
 from .potential import Potential
@@ -111,7 +112,6 @@ class Known:
     Attributes:
         mpc: The MPC with what is learned of it so far.
         table: The transitions, without what was taken out of them so far.
-        given: MPC_1, of which the method may have changed horizon and discount.
         groups: The parameter groups that are learned, ``("cost",)`` or ``("cost", "model")``.
         seed: Seeds everything.
         device: Torch device for what is large.
@@ -122,6 +122,8 @@ class Known:
         residual_share: The share of what the identified model missed that a learned residual explains; None where the
             model has none.
         result: What the fit found; the last stage leaves one.
+        given: MPC_1, of which the method may have changed horizon and discount.
+        found: What identification found; None where the model was not identified.
     """
 
     mpc: MPC
@@ -135,6 +137,7 @@ class Known:
     residual_share: float | None = None
     result: FitResult | None = None
     given: MPC | None = None
+    found: Identification | None = None
 
     @property
     def constant_value(self) -> ValueFunction:

@@ -17,9 +17,11 @@ from mpcoffline.core.text import check_name
 from mpcoffline.core.types import Array
 
 from .expressions import function_from_json, function_to_json, traced
+from .layout import Layout
 from .parameters import ParameterSpace
+from .signals import takes_signals
 
-ConstraintFunction = Callable[..., ca.SX]  # (x, u, p) -> h; (x, p) -> h at the end of the horizon
+ConstraintFunction = Callable[..., ca.SX]  # (x, u, p) -> h; (x, p) -> h at the end of the horizon; with signals d last
 
 
 class Penalty(NamedTuple):
@@ -45,12 +47,14 @@ class Sizes(NamedTuple):
         nu: Number of inputs.
         parameters: Those of the model.
         n_states: Number of the plant's states.
+        layout: Where the signals stand in the observation; None where there are none.
     """
 
     nx: int
     nu: int
     parameters: ParameterSpace
     n_states: int
+    layout: Layout | None = None
 
 
 class AnyConstraint(ABC):
@@ -79,7 +83,8 @@ class Constraint(AnyConstraint):
 
     Args:
         function: ``(x, u, p) -> h``, with ``terminal=True`` ``(x, p) -> h``: a CasADi column whose elements must not
-            be positive; ``p`` holds the model's parameters.
+            be positive; ``p`` holds the model's parameters. One more argument, ``(x, u, p, d)`` or ``(x, p, d)``, gets
+            the signals of that stage by name, as ``d.limit``.
         name: What a violated constraint is called in a solution's status.
         soft: None for a hard constraint, else the price of violating it.
         terminal: Whether it holds at the end of the horizon.
@@ -114,8 +119,11 @@ class Constraint(AnyConstraint):
                     self.name, expected=f"a function of inputs of sizes {expected} to a column", actual=str(found)
                 )
             return self
+        outside = []
+        if sizes.layout is not None and sizes.layout.signals and takes_signals(self.function, len(arguments) + 1):
+            outside = [sizes.layout.named(symbols[0][sizes.layout.present.tolist()])]
         try:
-            h = ca.densify(ca.SX(self.function(*arguments[:-1], sizes.parameters.symbols(arguments[-1]))))
+            h = ca.densify(ca.SX(self.function(*arguments[:-1], sizes.parameters.symbols(arguments[-1]), *outside)))
         except (TypeError, NotImplementedError, RuntimeError) as error:
             raise InvalidArgumentError(
                 self.name, expected="a function of CasADi SX expressions", actual=f"{type(error).__name__}: {error}"

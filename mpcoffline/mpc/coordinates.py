@@ -70,13 +70,14 @@ class Coordinates:
         return np.where(self.logarithmic, logarithms, (learned - self._theta_0) / self.scale)
 
     def theta(self, z: Tensor) -> Tensor:
-        """The full theta ``(size,)`` of z, differentiable in z."""
+        """The full theta ``(..., size)`` of z, differentiable in z."""
         theta_0, scale = torch.from_numpy(self._theta_0), torch.from_numpy(self.scale)
         logarithmic = torch.from_numpy(self.logarithmic)
         # The exponent is masked too: exp of a large linear coordinate would turn its unused gradient into NaN.
         grown = theta_0 * torch.exp(torch.where(logarithmic, z, 0.0))
         learned = torch.where(logarithmic, grown, theta_0 + scale * z)
-        return torch.from_numpy(self._full).masked_scatter(torch.from_numpy(self.mask), learned)
+        full = torch.from_numpy(self._full).expand(*z.shape[:-1], -1)
+        return full.masked_scatter(torch.from_numpy(self.mask), learned)
 
     def at_bounds(self, theta: Array) -> list[str]:
         """Names of the learned parameters that lie on one of their bounds."""

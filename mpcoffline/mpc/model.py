@@ -20,7 +20,7 @@ from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfa
 from .integrators import Scheme, exact_scheme, first_scheme, integrated
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
-from .signals import Signal, takes_signals
+from .signals import Named, Signal, takes_signals
 from .substeps import Choice, Flow, choice_from, choice_on
 from .torch_import import TorchExpression
 
@@ -120,10 +120,12 @@ class Model(Component):
         learn_weights: bool = False,
         integrator: str = "auto",
         delay: int | Sequence[int] | None = None,
+        signals: Sequence[Signal] = (),
     ) -> Model:
         """A model from a ``torch.nn.Module`` that was trained elsewhere.
 
-        The module maps rows of ``nx + nu`` numbers, or two arguments ``(x, u)``, to rows of ``nx``. What it is made of
+        The module maps rows of ``nx + nu`` numbers, or two arguments ``(x, u)``, to rows of ``nx``; with ``signals``
+        rows of ``nx + nu + len(signals)``, or three arguments ``(x, u, d)``. What it is made of
         becomes CasADi arithmetic: Linear, LayerNorm, BatchNorm1d (as in ``eval()``), Tanh, ReLU, LeakyReLU, ELU, GELU,
         SiLU, Sigmoid, Softplus, Softsign, Hardtanh, Identity, Dropout (left out), torch's functions of that kind, sums
         and products with buffers (normalisation), ``torch.cat(..., dim=-1)`` and ``x[..., a:b]``.
@@ -145,6 +147,7 @@ class Model(Component):
                 underscores (``0_weight``); by default they are fixed numbers, with which C computes much faster.
             integrator: As in the class, for ``discrete=False``.
             delay: As in the class.
+            signals: As in the class; the module gets their present values, in this order.
 
         Raises:
             InvalidArgumentError: For what cannot be traced, a layer that is not known (it is named), or sizes that do
@@ -152,18 +155,21 @@ class Model(Component):
         """
         network = TorchExpression(module)
 
-        def dynamics(x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        def dynamics(x: ca.SX, u: ca.SX, p: dict[str, ca.SX], d: Named) -> ca.SX:
+            outside = [ca.vertcat(*(d[signal.name] for signal in signals))] if signals else []
             try:
-                out = network(x, u, p if learn_weights else None)
+                out = network([x, u, *outside], p if learn_weights else None)
             except (RuntimeError, IndexError) as error:
+                sizes = " + ".join(str(size) for size in (nx, nu, len(signals)) if size)
                 raise InvalidArgumentError(
-                    "module", expected=f"one of {nx} + {nu} numbers a row", actual=str(error).splitlines()[-1][:200]
+                    "module", expected=f"one of {sizes} numbers a row", actual=str(error).splitlines()[-1][:200]
                 ) from error
             return x + out if residual else out
 
         parameters = network.weights if learn_weights else None
         is_map = discrete or residual
-        return cls(dynamics, nx, nu, dt, parameters, discrete=is_map, integrator=integrator, delay=delay)
+        options: dict[str, Any] = {"integrator": integrator, "delay": delay, "signals": signals}
+        return cls(dynamics, nx, nu, dt, parameters, discrete=is_map, **options)
 
     def _take(self, function: ca.Function, integrator: str, scheme: Scheme | None, *, settled: bool = True) -> None:
         """Takes an ODE with its scheme, or without one a map as it is."""

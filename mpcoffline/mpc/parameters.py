@@ -21,10 +21,12 @@ from mpcoffline.core.limits import check_limit
 from mpcoffline.core.text import LONGEST, check_name, check_unit
 from mpcoffline.core.types import Array
 
+from .psd import psd_factor
+
 Kind = Literal["free", "psd"]
 Group = Literal["model", "cost", "terminal", "reference"]
+Varies = Literal["episode"]
 
-_PSD_TOLERANCE = 1e-9  # relative to the diagonal
 _PREFIX = 20  # characters that an MPC puts in front of a name
 
 
@@ -37,18 +39,24 @@ class Parameter:
         low: Lower bound, a number or an array of the value's shape.
         high: Upper bound, likewise.
         unit: Physical unit, for people, of the characters that names may have.
+        varies: ``"episode"`` where a model's parameter is another one in every logged episode, as a load or a feed.
+            Identification then finds its values, their mean, which the MPC takes, and their spread
+            (:class:`~mpcoffline.estimation.EpisodeSpread`).
 
     Raises:
-        InvalidArgumentError: If the value is not finite or lies outside the bounds, or the unit has other characters.
+        InvalidArgumentError: If the value is not finite or lies outside the bounds, the unit has other characters, or
+            it varies with something else.
     """
 
     value: ArrayLike
     low: ArrayLike = -np.inf
     high: ArrayLike = np.inf
     unit: str = ""
+    varies: Varies | None = None
 
     def __post_init__(self) -> None:
         check_unit("Parameter unit", self.unit)
+        _check_varies("Parameter varies", self.varies)
         value, low, high = (np.asarray(v, dtype=np.float64) for v in (self.value, self.low, self.high))
         if not np.isfinite(value).all() or value.ndim > 2:
             raise InvalidArgumentError(
@@ -75,9 +83,10 @@ class Block:
         kind: ``"free"`` or ``"psd"``.
         group: What it belongs to; learning selects by group.
         unit: Physical unit, for people; of the same characters.
+        varies: ``"episode"`` where the log has another value in every episode, which a model's parameter may.
 
     Raises:
-        InvalidArgumentError: For a name, unit, kind or group that is none.
+        InvalidArgumentError: For a name, unit, kind or group that is none, or another group's parameter that varies.
     """
 
     name: str
@@ -88,6 +97,7 @@ class Block:
     kind: Kind = "free"
     group: Group = "cost"
     unit: str = ""
+    varies: Varies | None = None
 
     def __post_init__(self) -> None:
         check_name("parameter name", self.name, longest=LONGEST + _PREFIX)
@@ -99,6 +109,11 @@ class Block:
                     expected=f"one of {', '.join(get_args(known))}",
                     actual=repr(given)[:LONGEST],
                 )
+        _check_varies(f"varies of {self.name}", self.varies)
+        if self.varies and (self.group, self.kind) != ("model", "free"):
+            raise InvalidArgumentError(
+                f"varies of {self.name}", expected="a parameter of the model", actual=f"one of group {self.group!r}"
+            )
 
     @classmethod
     def free(cls, name: str, parameter: Parameter | ArrayLike, group: Group) -> Block:
@@ -107,7 +122,7 @@ class Block:
         check_name("parameter name", name)
         value = np.asarray(spec.value, dtype=np.float64)
         low, high = (np.broadcast_to(np.asarray(b, np.float64), value.shape) for b in (spec.low, spec.high))
-        return cls(name, value.shape, value.ravel(), low.ravel(), high.ravel(), "free", group, spec.unit)
+        return cls(name, value.shape, value.ravel(), low.ravel(), high.ravel(), "free", group, spec.unit, spec.varies)
 
     @classmethod
     def psd(cls, name: str, matrix: ArrayLike, group: Group) -> Block:
@@ -192,7 +207,7 @@ class Block:
             "kind": self.kind,
             "group": self.group,
             "unit": self.unit,
-        }
+        } | ({"varies": self.varies} if self.varies else {})
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Block:
@@ -209,7 +224,7 @@ class Block:
             raise FileFormatError("parameter shape", expected="at most 2 sizes", actual=repr(data["shape"])[:LONGEST])
         name = check_name("parameter name", data["name"], error=FileFormatError)
         try:
-            block = cls(name, shape, theta, low, high, data["kind"], data["group"], data["unit"])
+            block = cls(name, shape, theta, low, high, data["kind"], data["group"], data["unit"], data.get("varies"))
         except InvalidArgumentError as error:
             raise FileFormatError(f"parameter {name}", expected=error.expected, actual=error.actual) from error
         n = shape[0] if shape else 1
@@ -284,6 +299,11 @@ class ParameterSpace(Sequence[Block]):
         parts = [np.full(block.size, block.group in groups) for block in self.blocks]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=bool)
 
+    @property
+    def varying(self) -> NDArray[np.bool_]:
+        """Which coordinates are others in every logged episode, ``(size,)``."""
+        return np.array([block.varies is not None for block in self for _ in range(block.size)], dtype=bool)
+
     def unpack(self, theta: Array) -> dict[str, Array]:
         """The parameters by name in their natural shapes, from theta ``(size,)``."""
         return {block.name: block.natural(theta[self.slices[block.name]]) for block in self.blocks}
@@ -353,48 +373,6 @@ class ParameterSpace(Sequence[Block]):
         return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def psd_factor(matrix: Array, name: str = "matrix") -> Array:
-    """The lower-triangular C ``(n, n)`` with C C' = matrix and a non-negative diagonal; works for singular matrices.
-
-    Raises:
-        InvalidArgumentError: If the matrix is not square, finite, symmetric and positive semidefinite.
-    """
-    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise InvalidArgumentError(name, expected="a square matrix", actual=f"shape {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise InvalidArgumentError(name, expected="finite entries", actual=str(matrix.tolist()))
-    units = _units(matrix)
-    scaled = matrix / units[:, None] / units
-    asymmetry = np.abs(scaled - scaled.T)
-    if asymmetry.max(initial=0.0) > _PSD_TOLERANCE:
-        i, j = np.unravel_index(int(asymmetry.argmax()), asymmetry.shape)
-        differ = f"entries that differ from their mirror by {abs(matrix[i, j] - matrix[j, i]):.3g}"
-        raise InvalidArgumentError(name, expected="a symmetric matrix", actual=differ)
-    if np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -_PSD_TOLERANCE:
-        smallest = np.linalg.eigvalsh((matrix + matrix.T) / 2.0)[0]
-        raise InvalidArgumentError(
-            name, expected="a positive semidefinite matrix", actual=f"smallest eigenvalue {smallest:.3g}"
-        )
-    symmetric = (matrix + matrix.T) / 2.0
-    try:
-        return np.asarray(np.linalg.cholesky(symmetric))
-    except np.linalg.LinAlgError:  # singular
-        factor = _singular_factor(symmetric)
-    if (np.abs(factor @ factor.T - symmetric) > _PSD_TOLERANCE * np.outer(units, units)).any():  # of unequal units
-        factor = units[:, None] * _singular_factor((scaled + scaled.T) / 2.0)
-    return factor
-
-
-def _units(matrix: Array) -> Array:
-    """What each row and column of a weight is measured by: the root of its diagonal element, else of the largest."""
-    largest = float(np.abs(matrix).max(initial=0.0))
-    diagonal = np.diag(matrix)
-    return np.asarray(np.sqrt(np.where(diagonal > 0.0, diagonal, largest if largest > 0.0 else 1.0)))
-
-
-def _singular_factor(matrix: Array) -> Array:
-    """The lower-triangular factor of a symmetric matrix without its negative eigenvalues: QR of its root's factor."""
-    eigenvalues, vectors = np.linalg.eigh(matrix)
-    upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T).R
-    signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
-    return np.asarray((upper * signs[:, None]).T)
+def _check_varies(what: str, given: object) -> None:
+    if given not in (None, *get_args(Varies)):
+        raise InvalidArgumentError(what, expected="'episode', or None", actual=repr(given)[:LONGEST])

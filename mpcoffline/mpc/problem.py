@@ -365,7 +365,7 @@ class MPC:
 
 
 def _sizes(model: Model) -> Sizes:
-    return Sizes(model.ny, model.nu, model.space, model.layout.n_states)
+    return Sizes(model.ny, model.nu, model.space, model.layout.n_states, model.layout)
 
 
 def _discount(value: object) -> float:

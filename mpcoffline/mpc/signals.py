@@ -101,11 +101,11 @@ class Named:
         return self[name]
 
 
-def takes_signals(dynamics: Callable[..., Any]) -> bool:
-    """Whether a function of the user takes signals as its fourth argument."""
+def takes_signals(function: Callable[..., Any], count: int = 4) -> bool:
+    """Whether a function of the user takes signals as its last of so many arguments, ``(x, u, p, d)``."""
     try:
-        parameters = inspect.signature(dynamics).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # of what is built in
         return False
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters) >= 4
+    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters) >= count

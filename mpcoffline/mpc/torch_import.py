@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -83,7 +83,8 @@ class TorchExpression:
     """A module as a function of CasADi columns, with its weights as numbers or as symbols.
 
     Args:
-        module: Takes rows of numbers, or two arguments, states and inputs; taken as in ``eval()``.
+        module: Takes rows of numbers, or states, inputs and, where there are some, signals as arguments of their own;
+            taken as in ``eval()``.
 
     Attributes:
         weights: Its learnable tensors by name, dots as underscores, in float64.
@@ -114,19 +115,18 @@ class TorchExpression:
         }
         self.weights = {_named(name): self._tensors[name] for name, _ in self._module.named_parameters()}
 
-    def __call__(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX] | None = None) -> ca.SX:
-        """The module's output for x ``(nx, 1)`` and u ``(nu, 1)``, a column.
+    def __call__(self, parts: Sequence[ca.SX], p: Mapping[str, ca.SX] | None = None) -> ca.SX:
+        """The module's output for states, inputs and, if any, signals, a column.
 
         Args:
-            x: States.
-            u: Inputs; behind the states where the module takes one argument.
+            parts: These columns; one behind the other where the module takes one argument.
             p: Symbols for its weights by name, in their shapes; numbers when None.
 
         Raises:
             InvalidArgumentError: For a layer or an operation that is not known.
         """
         placeholders = sum(node.op == "placeholder" for node in self._graph.graph.nodes)
-        given = iter([ca.vertcat(x, u)] if placeholders == 1 else [x, u])
+        given = iter([ca.vertcat(*parts)] if placeholders == 1 else parts)
         work: dict[Any, Any] = {}
 
         def value(argument: Any) -> Any:
@@ -138,7 +138,9 @@ class TorchExpression:
             arguments, settings = [value(a) for a in node.args], {key: value(a) for key, a in node.kwargs.items()}
             if node.op == "placeholder":
                 if (work_value := next(given, None)) is None:
-                    raise InvalidArgumentError("module", expected="one or two arguments", actual=str(placeholders))
+                    raise InvalidArgumentError(
+                        "module", expected=f"one argument, or {len(parts)}", actual=str(placeholders)
+                    )
                 work[node] = work_value
             elif node.op == "get_attr":
                 work[node] = self._tensor(str(node.target), p)

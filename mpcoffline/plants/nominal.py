@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -108,7 +109,7 @@ def _parameters(plant: Plant, alpha: float, seed: int | None) -> dict[str, Param
     return parameters
 
 
-def _bounds(true: Array, value: Array) -> dict[str, Array]:
+def _bounds(true: Array, value: Array) -> dict[str, Any]:
     """From 1/100 to 100 times a number of either sign, and to where MPC_1 begins; a zero has no size, and no bounds."""
     ends = 0.01 * true, 100.0 * true
     low, high = np.minimum(np.minimum(*ends), value), np.maximum(np.maximum(*ends), value)

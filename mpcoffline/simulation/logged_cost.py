@@ -1,41 +1,47 @@
-"""The stage cost L(s, a) as a function, learned from the logged costs: simulations need it where nothing was logged."""
+"""The stage cost L(s, a) as a function, from the logged costs: simulations need it where nothing was logged."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
-from mpcoffline.datasets.table.memory import gathered
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.learning.known_cost import excerpt, known_cost
+from mpcoffline.learning.known_cost import ROUNDING, agreeing_cost, excerpt
+from mpcoffline.learning.stages import KnownCost
 from mpcoffline.mpc import MPC
 
+from .cost_ends import learned_ends
+from .cost_regression import cost_regressions, folds_of
+
 _ROWS = 20_000
-_N_FEATURES = 400
-_EXACT = 1.0 - 1e-6  # R2 of a quadratic beyond which nothing else is needed
-_HELD_OUT = 0.2
 
 
 class LoggedCost:
-    """L(s, a) by regression of the logged costs.
+    """L(s, a) as the log has it: the MPC's stage cost where that was logged, else a regression of the logged costs.
 
-    The MPC's stage cost, where that is what was logged (:func:`~mpcoffline.learning.known_cost`); a full quadratic in
-    (s, a) where that is exact. Otherwise the quadratic with random features (hyperbolic tangents, which stay bounded
-    outside the data, so that there the quadratic decides), by ridge regression, and never below the cheapest logged
-    cost, as beyond the data it is a guess. A part of the episodes is held out to measure how good it is.
+    The MPC's own expression counts where it agrees with all logged costs, up to scale, offset, other weights, and
+    noise in the states (:func:`~mpcoffline.learning.known_cost.known_cost`). Else it is the better one of a
+    quadratic and a small network (:func:`~mpcoffline.simulation.cost_regression.cost_regressions`), of the
+    rows as they were logged: with smoothed ones a regulated plant's cost looks like that of another plant. Rows that
+    end an episode are no part of it; what an end costs is learned by itself. ``L -> a L + b`` changes all costs
+    likewise and nothing else. Where L depends on s+, this is its mean given (s, a).
 
     Args:
-        table: The transitions; smoothed, where s is noisy.
-        seed: Seeds features and split.
+        table: The transitions.
+        seed: Seeds the split and the weights.
         seen: How many coordinates of s the cost may depend on, the first ones; all by default.
         mpc: Its stage cost may be the logged one.
         logged: The transitions as they were logged, where ``table`` is smoothed.
 
     Attributes:
-        r2: Share of the variance of held-out costs that it explains.
-        low: The cheapest logged cost.
+        known: How the logged costs follow from the MPC's stage cost; None where they do not.
+        r2: Share of the variance of the costs on held-out episodes that it explains; of those in the log, where it is
+            the MPC's.
+        r2_second: The same of the second regression.
         exact: Whether the MPC's stage cost or a quadratic is exact.
+        low: The cheapest logged cost.
+        ends: Where episodes end, and at what price.
     """
 
     def __init__(
@@ -47,50 +53,86 @@ class LoggedCost:
         mpc: MPC | None = None,
         logged: TransitionTable | None = None,
     ) -> None:
-        known = None if mpc is None else known_cost(mpc, excerpt(table if logged is None else logged, seed))
-        self._known = None if known is None or known.constant or known.agreeing < 1.0 else known
-        self._mpc = mpc
-        rng = np.random.default_rng(seed)
+        table = table if logged is None else logged
         self._seen = table.ny if seen is None else seen
-        table = table if self._seen == table.ny else gathered(table, range(self._seen))
-        train, test = table.split(1.0 - _HELD_OUT, seed) if table.n_episodes > 4 else _rows_split(table, rng)
-        (x, cost), (x_test, cost_test) = (_sample(part, rng) for part in (train, test))
-        self._level = float(cost.mean())  # a large constant, which ridges would shrink
-        self._features = RandomFeatures(x, 0, rng)
-        self._fit(x, cost)
-        self.exact = self._known is not None or self._r2(x_test, cost_test) > _EXACT
-        if not self.exact:
-            self._features = RandomFeatures(x, _N_FEATURES, rng)
-            self._fit(x, cost)
-        self.r2 = self._r2(x_test, cost_test) if self._known is None else 1.0 - self._known.missed
-        self.low = float(min(cost.min(), cost_test.min()))
-
-    def _fit(self, x: Array, cost: Array) -> None:
-        self._regression = Ridge.fit(self._features(x), cost[:, None] - self._level)
-
-    def _r2(self, x: Array, cost: Array) -> float:
-        missed = cost - self._level - self._regression(self._features(x))[:, 0]
-        variance = float(np.var(cost))
-        return 1.0 - float(np.mean(missed**2)) / variance if variance > 0.0 else 1.0
+        agreeing = None if mpc is None else _agreeing(mpc, excerpt(table, seed))
+        self._mpc: MPC | None = None if agreeing is None else agreeing[0]
+        self.known: KnownCost | None = None if agreeing is None else agreeing[1]
+        over = np.asarray(table.terminations) > 0.0
+        going = table.take(np.flatnonzero(~over)) if over.any() and not over.all() else table
+        rows = going.take(_some(len(going), seed))
+        x, cost = self._columns(rows)
+        self._dearest, self.low = float(cost.max()), float(cost.min())
+        self._regressions = cost_regressions(x, cost, folds_of(rows, seed), seed)
+        others = self._regressions[0 if self.known is not None else 1 :] or self._regressions
+        self._other = others[0]
+        self.r2 = 1.0 - (self._regressions[0].error if self.known is None else self.known.missed)
+        self.r2_second = 1.0 - self._other.error
+        self.exact = self.known is not None or self._regressions[0].exact
+        last = table.take(np.flatnonzero(over)).values()
+        prices = last.costs - self(last.observations, last.actions)
+        self.ends = learned_ends(table, prices, seed, self._seen)
 
     def __call__(self, s: Array, a: Array) -> Array:
-        """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``."""
-        if self._known is not None and self._mpc is not None:
-            ours = self._mpc.stage_function(s.T, a.T, self._mpc.theta).full().ravel()
-            return np.asarray(self._known.scale * ours + self._known.offset)
-        cost = self._regression(self._features(np.hstack([s[:, : self._seen], a])))[:, 0] + self._level
-        return np.asarray(cost if self.exact else np.maximum(cost, self.low))
+        """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``; the dearest logged cost where it is no number."""
+        if self._mpc is None or self.known is None:
+            return self._regressions[0](np.hstack([s[:, : self._seen], a]))
+        ours = self._mpc.stage_function(s.T, a.T, self._mpc.theta).full().ravel()
+        cost = self.known.scale * ours + self.known.offset
+        return np.asarray(np.where(np.isfinite(cost), cost, self._dearest))
+
+    def second(self, s: Array, a: Array) -> Array:
+        """L by another regression: what both agree on hardly hangs on how L was learned.
+
+        It is the same function where that is exact.
+        """
+        if self.exact and (self.known is None or self.known.missed <= ROUNDING):
+            return self(s, a)
+        return self._other(np.hstack([s[:, : self._seen], a]))
+
+    def ended(self, s: Array, a: Array, reached: Array) -> NDArray[np.bool_]:
+        """Whether steps from s ``(B, nx)`` under a ``(B, nu)`` to ``reached`` end an episode, ``(B,)``.
+
+        Then the step costs :attr:`end_price` more than L(s, a), and nothing follows.
+        """
+        del s, a  # of an end these tell less than the state it is reached with
+        return self.ends(reached[:, : self._seen])
+
+    @property
+    def end_price(self) -> float:
+        """What a step that ends an episode costs more than L(s, a); 0 where none was logged."""
+        return self.ends.price
+
+    def __str__(self) -> str:
+        """What the cost is, and how well it agrees with the log, in a sentence."""
+        if self.known is not None:
+            said = f"the MPC's own stage cost, {self.known}"
+        elif self.exact:
+            said = f"{self._regressions[0].name} of states and inputs, exact to rounding"
+        else:
+            said = (
+                f"{self._regressions[0].name} of states and inputs, learned from the logged costs, of whose variance it"
+                f" explains {_share(self.r2)} on held-out episodes ({self._other.name} beside it, as a check,"
+                f" {_share(self.r2_second)})"
+            )
+        return f"Costs in simulations: {said}; {self.ends}." if self.ends.count else f"Costs in simulations: {said}."
+
+    def _columns(self, table: TransitionTable) -> tuple[Array, Array]:
+        columns = table.values()
+        return np.hstack([columns.observations[:, : self._seen], columns.actions]), columns.costs
 
 
-def _rows_split(table: TransitionTable, rng: np.random.Generator) -> tuple[TransitionTable, TransitionTable]:
-    """A split by rows, where there are hardly any episodes."""
-    order = rng.permutation(len(table))
-    cut = max(1, int((1.0 - _HELD_OUT) * len(table)))
-    train, test = np.sort(order[:cut]), np.sort(order[min(cut, len(table) - 1) :])
-    return table.take(train), table.take(test)
+def _agreeing(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | None:
+    """The MPC whose stage cost agrees with all logged costs, if there is one."""
+    found = agreeing_cost(mpc, table)
+    return None if found is None or found[1].constant or found[1].agreeing < 1.0 else found
 
 
-def _sample(table: TransitionTable, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Some rows as (s, a) and cost in float64."""
-    columns = table.sample(_ROWS, rng).values()
-    return np.hstack([columns.observations, columns.actions]), columns.costs
+def _share(r2: float) -> str:
+    """In per cent, with as many digits as tell it from all."""
+    missed = max(1.0 - r2, 1e-12)
+    return f"{100.0 * r2:.{int(np.clip(np.ceil(-np.log10(100.0 * missed)), 0, 4)) + 1}f} %"
+
+
+def _some(n: int, seed: int) -> NDArray[np.intp]:
+    return np.arange(n) if n <= _ROWS else np.sort(np.random.default_rng(seed).permutation(n)[:_ROWS])

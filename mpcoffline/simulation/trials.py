@@ -9,7 +9,29 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.control.course import Course
+from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc.layout import Layout
+from mpcoffline.solvers import Plan
+
+from .closed_loop import signals_along
+from .logged_cost import LoggedCost
+from .models import LogModels
+
+_ARRAYS = {
+    "votes": "b",
+    "cost": "f",
+    "second": "f",
+    "lost": "b",
+    "rows": "i",
+    "returns": "f",
+    "judged": "b",
+    "n_steps": "i",
+}
+_NOISE = 7
+_RUN_AWAY = 30.0  # spreads of the data: a state this far out has left what any model of them knows
 
 
 class Controller(Protocol):
@@ -47,15 +69,173 @@ class Trials:
     judged: NDArray[np.bool_]
     n_steps: int
 
+    @classmethod
+    def none(cls, names: Sequence[str], around: Surroundings, judged: NDArray[np.bool_]) -> Trials:
+        """Before the first."""
+        shape = len(names), len(around.models), len(around.rows)
+        cost, second, lost = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+        models, rows, returns = around.models, around.rows, around.returns
+        parts = cost, second, lost, rows, returns, judged, around.n_steps
+        return cls(tuple(names), models.names, models.votes, *parts)
+
+    def fill(self, name: str, around: Surroundings, controller: Controller, starts: slice) -> Episodes:
+        """Adds what a controller does from some of the starts."""
+        done, k = around.act(controller, starts), self.names.index(name)
+        self.cost[k, :, starts], self.second[k, :, starts], self.lost[k, :, starts] = done.cost, done.second, done.lost
+        return done
+
+    def with_names(self, more: Sequence[str]) -> Trials:
+        """With further controllers, not tried yet."""
+        if not more:
+            return self
+        shape = len(more), *self.cost.shape[1:]
+        cost, second = (np.concatenate([costs, np.full(shape, np.nan)]) for costs in (self.cost, self.second))
+        lost = np.concatenate([self.lost, np.zeros(shape, dtype=bool)])
+        return replace(self, names=(*self.names, *more), cost=cost, second=second, lost=lost)
+
     def of(self, name: str) -> Array:
         """The costs of a controller, ``(models, starts)``."""
         return np.asarray(self.cost[self.names.index(name)])
 
-    def joined(self, others: Sequence[Trials]) -> Trials:
-        """With trials of further controllers on the same models from the same starts."""
-        parts = [self, *others]
-        return replace(
-            self,
-            names=tuple(name for part in parts for name in part.names),
-            **{key: np.concatenate([getattr(part, key) for part in parts]) for key in ("cost", "second", "lost")},
-        )
+    def differences(self, name: str, *, second: bool = False) -> Array:
+        """Costs of a controller less those of MPC_1, ``(models, starts)``."""
+        costs = self.second if second else self.cost
+        return np.asarray(costs[self.names.index(name)] - costs[0])
+
+    def improves(self, name: str) -> bool:
+        """Whether it costs less than MPC_1 on the median model from the starts that judge, by both regressions."""
+        gains = (self.differences(name, second=second)[self.votes][:, self.judged] for second in (False, True))
+        return all(np.median(gain.mean(axis=1)) < 0.0 for gain in gains)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """The numbers; the names are not among them."""
+        return {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+
+    @classmethod
+    def from_arrays(cls, names: tuple[str, ...], models: tuple[str, ...], arrays: Mapping[str, NDArray[Any]]) -> Trials:
+        """The inverse of :meth:`to_arrays`.
+
+        Raises:
+            FileFormatError: For arrays that are missing, or of other shapes or types.
+        """
+        n = np.size(arrays.get("rows", ()))
+        shapes: dict[str, tuple[int, ...]] = {name: (len(names), len(models), n) for name in ("cost", "second", "lost")}
+        shapes |= {"votes": (len(models),), "n_steps": ()} | dict.fromkeys(("rows", "returns", "judged"), (n,))
+        for name, kind in _ARRAYS.items():
+            array = arrays.get(name)
+            if array is None or array.shape != shapes[name] or array.dtype.kind != kind:
+                actual = "none" if array is None else f"{array.dtype} {array.shape}"
+                raise FileFormatError(f"trials/{name}", expected=f"shape {shapes[name]}, kind {kind}", actual=actual)
+        parts = {name: arrays[name] for name in _ARRAYS if name != "n_steps"}
+        return cls(names=names, models=models, n_steps=int(arrays["n_steps"]), **parts)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """A controller in closed loop with each model from each start.
+
+    Attributes:
+        cost: ``(models, starts)``, as in :class:`Trials`.
+        second: Likewise.
+        lost: Likewise.
+        states: States with the first model, past inputs included, ``(starts, T + 1, nx)``.
+        actions: Inputs with the first model, ``(starts, T, nu)``.
+    """
+
+    cost: Array
+    second: Array
+    lost: NDArray[np.bool_]
+    states: Array
+    actions: Array
+
+
+class Surroundings:
+    """All that happens to a controller in a trial but for what it does itself: the same for all controllers.
+
+    Args:
+        models: The models of the log.
+        cost: The logged cost as a function.
+        table: Transitions of the models' states, past inputs included.
+        rows: Where in the table the episodes begin, ``(starts,)``.
+        n_steps: Their length.
+        layout: Of the models' states.
+        seed: Of the measurement noise.
+    """
+
+    def __init__(
+        self,
+        models: LogModels,
+        cost: LoggedCost,
+        table: TransitionTable,
+        rows: NDArray[np.intp],
+        n_steps: int,
+        layout: Layout,
+        seed: int = 0,
+    ) -> None:
+        self.models, self.cost, self.rows, self.n_steps, self._layout = models, cost, rows, n_steps, layout
+        columns = table.values()
+        self.starts = columns.observations[rows]
+        self.signals = signals_along(table, rows, n_steps, layout)
+        self.disturbances = models.replayed(table, rows, n_steps)
+        rng = np.random.default_rng([seed, _NOISE])
+        self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
+        self.returns = returns_along(table, rows, n_steps)
+        states = columns.observations
+        self._middle, spread = states.mean(axis=0), states.std(axis=0)
+        reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
+        self._reach = np.where((spread > 0.0) & (np.arange(len(reach)) < layout.n_states), reach, np.inf)
+        self._dearest = float(columns.costs.max())
+
+    def act(self, controller: Controller, starts: slice = slice(None)) -> Episodes:
+        """Closed loops of a controller on all models from all starts; all decisions of a step are one batch.
+
+        A state that runs away stays where it was and costs as much as the dearest logged transition from then on; an
+        episode that ends as those of the log do costs nothing more.
+
+        Args:
+            controller: What acts.
+            starts: From which starts; all by default.
+        """
+        ny, n, m, begun = self._layout.ny, self._layout.n_states, len(self.models), self.starts[starts]
+        s, noise, disturbances = len(begun), self.noise[:, starts], self.disturbances[:, starts]
+        signals, x = self.signals[starts], np.broadcast_to(begun, (m, *begun.shape)).copy()
+        lost, over = np.zeros((m, s), dtype=bool), np.zeros((m, s), dtype=bool)
+        total, second, states, actions = np.zeros((m, s)), np.zeros((m, s)), [x[0].copy()], []
+        course: Any = None
+        mpc = getattr(controller, "mpc", None)
+        if mpc is not None and mpc.nx == x.shape[2] > ny:  # it knows what was applied before, as in midst of an episode
+            course = Course(*Plan.none(m * s, mpc), x.reshape(m * s, -1)[:, ny:])
+        for k in range(self.n_steps):
+            seen = x[:, :, :ny].copy()
+            seen[:, :, :n] += noise[k]
+            u, course = controller.predict(seen.reshape(m * s, ny), state=course)
+            u = np.asarray(u, dtype=np.float64)
+            flat = x.reshape(m * s, -1)
+            for costs, function in ((total, self.cost), (second, self.cost.second)):
+                stage = function(flat, u).reshape(m, s)
+                costs += np.where(over, 0.0, np.where(lost, self._dearest, stage))
+            reached = self.models.step(x, u.reshape(m, s, -1))
+            reached[:, :, :n] += disturbances[:, :, k]
+            ended = self.cost.ended(flat, u, reached.reshape(m * s, -1)).reshape(m, s) & ~lost & ~over
+            total += np.where(ended, self.cost.end_price, 0.0)
+            second += np.where(ended, self.cost.end_price, 0.0)
+            over |= ended
+            lost |= ~(np.abs(reached - self._middle) < self._reach).all(axis=2) & ~over
+            x = np.where((lost | over)[:, :, None], x, reached)
+            x[:, :, n:ny] = signals[:, k]
+            states.append(x[0].copy())
+            actions.append(u.reshape(m, s, -1)[0])
+        return Episodes(total, second, lost | over, np.stack(states, axis=1), np.stack(actions, axis=1))
+
+
+def returns_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) -> Array:
+    """What the log cost over the steps that begin in some rows, ``(rows,)``.
+
+    An episode that ends in a terminal state costs nothing afterwards; one that is cut off before ``n_steps`` gives NaN.
+    """
+    lasts = np.append(table.episodes.firsts[1:], len(table)) - 1
+    own = lasts[np.searchsorted(lasts, rows)]
+    ends = np.minimum(own, rows + n_steps - 1)
+    total = np.concatenate([[0.0], np.cumsum(table.values().costs)])
+    whole = (rows + n_steps - 1 <= own) | (np.asarray(table.terminations)[own] > 0.0)
+    return np.where(whole, total[ends + 1] - total[rows], np.nan)

@@ -148,7 +148,7 @@ def _learn(
     learners: dict[str, tuple[OfflineMPCLearner, float]] = {}
     value_function = None
     for name, learn in _LEARNED.items():
-        learner = OfflineMPCLearner(nominal, learn, value_function=value_function, **options)
+        learner = OfflineMPCLearner(nominal, learn, value_function=value_function, **{"candidate": "full"} | options)
         start = time.perf_counter()
         learner.fit(data, show_progress=progress)
         learners[name] = learner, time.perf_counter() - start

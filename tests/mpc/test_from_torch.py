@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.mpc import MPC, Model, QuadraticCost, Signal
 from mpcoffline.mpc.torch_twin import TorchTwin
 
 NX, NU = 4, 2
@@ -165,3 +165,37 @@ class Sorting(nn.Module):
 def test_what_is_refused_is_named(network: Any, words: str) -> None:
     with pytest.raises(InvalidArgumentError, match=words):
         Model.from_torch(network, NX, NU, 0.1)
+
+
+class WithSignals(nn.Module):
+    """Three arguments: states, inputs, signals."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(NX + NU + 2, 8), nn.Tanh(), nn.Linear(8, NX))
+
+    def forward(self, x: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return self.net(torch.cat([x, u, d], dim=-1)) * d[..., 1:2]
+
+
+@pytest.mark.parametrize("made", [lambda: WithSignals().net, WithSignals])
+def test_a_module_gets_the_present_values_of_signals(made: Callable[[], nn.Module]) -> None:
+    torch.manual_seed(0)
+    network = made().double()
+    signals = [Signal("price", preview=1), Signal("inflow")]
+    model = Model.from_torch(network, NX, NU, 0.1, signals=signals, delay=1)
+    rng = np.random.default_rng(0)
+    x, u, past, inflow, prices = (rng.normal(size=n) for n in (NX, NU, NU, 1, 2))
+    z = np.concatenate([x, prices, inflow, past])
+    outside = np.array([prices[0], inflow[0]])
+    arguments = [torch.from_numpy(v) for v in (x, past, outside)]
+    with torch.no_grad():
+        expected = network(*arguments) if isinstance(network, WithSignals) else network(torch.cat(arguments))
+    np.testing.assert_allclose(model(z, u)[:NX], expected.numpy(), rtol=1e-12)
+
+
+def test_a_module_without_room_for_signals_is_refused() -> None:
+    with pytest.raises(InvalidArgumentError, match=r"4 \+ 2 \+ 1 numbers"):
+        Model.from_torch(module("tanh"), NX, NU, 0.1, signals=[Signal("price")])
+    with pytest.raises(InvalidArgumentError, match="one argument, or 2"):
+        Model.from_torch(WithSignals(), NX, NU, 0.1)

@@ -12,7 +12,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
-from mpcoffline.mpc.parameters import Block, Parameter, ParameterSpace, psd_factor
+from mpcoffline.mpc.parameters import Block, Parameter, ParameterSpace
+from mpcoffline.mpc.psd import psd_factor
 
 Array = NDArray[np.float64]
 numbers = st.floats(-1e3, 1e3)

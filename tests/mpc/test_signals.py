@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from mpcoffline import MPC, Model, MPCPolicy, Parameter, QuadraticCost, Signal, StateBounds
+from mpcoffline import MPC, Constraint, Model, MPCPolicy, Parameter, QuadraticCost, Signal, StateBounds
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import LiftedCost, polynomial_features
 from mpcoffline.mpc.component import Component
@@ -95,6 +95,25 @@ def test_a_battery_with_a_price_preview_against_a_linear_programme() -> None:
     read = MPC.from_json(json.loads(json.dumps(mpc.to_json())))
     z, u = rng.normal(size=mpc.nx), [0.7]
     assert float(read.stage_function(z, u, read.theta)) == pytest.approx(float(mpc.stage_function(z, u, mpc.theta)))
+
+
+def test_a_limit_that_is_a_signal_holds_step_by_step_and_at_the_end() -> None:
+    """An integrator drawn up to a ceiling that was previewed: as far as the lower of ceiling and reach allow."""
+    n, ceiling = 5, np.array([9.0, 1.0, 0.4, 1.5, 0.2, 0.7])
+    model = Model(lambda x, u, p: x + u, 1, 1, 1.0, discrete=True, signals=[Signal("top", preview=n)])
+    limits = [
+        Constraint(lambda x, u, p, d: x[0] - d.top, "ceiling"),
+        Constraint(lambda x, p, d: x[0] - d["top"], "last ceiling", terminal=True),
+    ]
+    cost = QuadraticCost([[1.0]], [[1e-8]], x_ref=[3.0])
+    mpc = MPC(model, cost, QuadraticCost([[1.0]], x_ref=[3.0]), n, 1.0, [-5.0], [5.0], constraints=limits)
+    read = MPC.from_json(json.loads(json.dumps(mpc.to_json())))
+    for problem in (mpc, read):
+        found = make_solver(problem, "ipopt").solve(np.array([0.0, *ceiling]))
+        assert found.success
+        np.testing.assert_allclose(found.x[1:, 0], ceiling[1:], atol=1e-5)
+    with pytest.raises(InvalidArgumentError, match="signal 'floor'"):
+        mpc.replace(constraints=[Constraint(lambda x, u, p, d: d.floor - x[0])])
 
 
 def test_dynamics_take_the_present_value_by_name() -> None:

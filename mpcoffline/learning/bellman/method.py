@@ -10,7 +10,9 @@ from mpcoffline.learning.known_cost import CostConfig, with_known_cost
 from mpcoffline.learning.method import METHODS, Method
 from mpcoffline.learning.stages import Change, Known, Stage
 from mpcoffline.learning.value.config import ValueConfig
+from mpcoffline.mpc import MPC
 
+from .candidates import candidates, with_learned_residual
 from .regression import ParameterConfig
 from .stages import (
     LearnParameters,
@@ -59,6 +61,14 @@ class Bellman(Method):
     def prepared(self, known: Known) -> Known:
         """The dead time of the inputs, found in the data or checked (``init="identified"``)."""
         return with_dead_time(known, self.identify)
+
+    def candidates(self, known: Known) -> dict[str, MPC]:
+        """The identified model with the costs that were given, and with V; see :func:`candidates`."""
+        return candidates(known, self.terminal)
+
+    def variants(self, known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
+        """The candidate with a learned residual, where held-out episodes ask for one."""
+        return with_learned_residual(known, name, mpc)
 
     def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""

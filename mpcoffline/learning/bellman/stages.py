@@ -88,9 +88,10 @@ def identified(known: Known, config: StartConfig) -> Known:
     if rows is not known.table:
         silent, identified = found.noise.negligible, known.mpc.replace(model=found.model)
         table = known.table if silent else smooth(identified, known.table, found.theta, found.noise)
+    known = replace(known, table=table, found=found)
     if "model" not in known.groups:
-        return replace(known, table=table)
-    known = replace(known, mpc=known.mpc.replace(model=found.model), table=table, model_error=found.error_after)
+        return known
+    known = replace(known, mpc=known.mpc.replace(model=found.model), model_error=found.error_after)
     return completed(known) if config.residual and found.error_after > config.adapt_above else known
 
 

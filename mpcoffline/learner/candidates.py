@@ -1,0 +1,185 @@
+"""What a fit could hand out: MPC_1, the whole fit and what lies between, tried on models of the log."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
+from mpcoffline.core.text import check_name
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.learning import Known
+from mpcoffline.mpc import MPC
+from mpcoffline.simulation.choice import FIRST, choose, quick_policy
+from mpcoffline.simulation.surroundings import surroundings_of
+from mpcoffline.simulation.trials import Trials
+
+FULL = "full"
+TRIALS = "trials/"  # in front of the names of their arrays in a file
+
+_SLOW = 10.0  # times as fast as ipopt, below which all starts on all models would take an hour
+_FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Candidates(Mapping[str, MPC]):
+    """The MPCs that were tried, by name, and how they did.
+
+    Example:
+        >>> print(learner.candidates)
+        >>> policy = MPCPolicy(learner.candidates["identified"])
+
+    Attributes:
+        mpcs: By name: ``"MPC_1"``, ``"full"`` and those between.
+        chosen: The one that the learner hands out.
+        trials: Their closed loops on models of the log; None where one was taken by name.
+    """
+
+    mpcs: Mapping[str, MPC]
+    chosen: str
+    trials: Trials | None = None
+
+    def __getitem__(self, name: str) -> MPC:
+        """The MPC of a name.
+
+        Raises:
+            UnknownIdError: For another name, with those that there are.
+        """
+        if name not in self.mpcs:
+            raise UnknownIdError.of("candidate", name, self.mpcs)
+        return self.mpcs[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is one of this name."""
+        return name in self.mpcs
+
+    def __iter__(self) -> Iterator[str]:
+        """The names."""
+        return iter(self.mpcs)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.mpcs)
+
+    @property
+    def finding(self) -> str:
+        """Which one was chosen and why, in a sentence."""
+        if self.trials is None:
+            return f"Handed out: {self.chosen!r}, as was asked."
+        votes = int(self.trials.votes.sum())
+        if not votes:
+            return "Handed out: MPC_1. No model predicts the log, so nothing could be tried."
+        where = f"of {len(self)} candidates in closed loop with {votes} models of the log"
+        if self.chosen == FIRST:
+            return f"Handed out: MPC_1, the best {where}."
+        gain = np.nanmean(self.trials.differences(self.chosen)[self.trials.votes], axis=1)
+        level = np.nanmean(self.trials.of(FIRST)[self.trials.votes], axis=1)
+        return (
+            f"Handed out: {self.chosen!r}, the best {where}: an episode costs {np.median(gain):+.3g} beside MPC_1's"
+            f" {np.median(level):.4g}."
+        )
+
+    def __str__(self) -> str:
+        """A line each: cost of an episode less that of MPC_1, over the models that have a vote."""
+        width = max(map(len, self.mpcs))
+        return "\n".join(
+            f"{'*' if name == self.chosen else ' '} {name:<{width}}  {self._figures(name)}".rstrip() for name in self
+        )
+
+    def _figures(self, name: str) -> str:
+        if self.trials is None:
+            return ""
+        if not self.trials.votes.any():
+            return "not tried: no model predicts the log"
+        costs = self.trials.of(name)[self.trials.votes]
+        tried = ~np.isnan(costs[0])
+        if not tried.any():
+            return "not tried"
+        if name == FIRST:
+            return f"{np.median(costs[:, tried].mean(axis=1)):.5g} an episode (median of {len(costs)} models)"
+        means = self.trials.differences(name)[self.trials.votes][:, tried].mean(axis=1)
+        return f"{np.median(means):+.3g} (models: {means.min():+.3g} to {means.max():+.3g}), {tried.sum()} starts"
+
+    @property
+    def mpc(self) -> MPC:
+        """The chosen one."""
+        return self[self.chosen]
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON-able description, of the trials the names."""
+        models = None if self.trials is None else list(self.trials.models)
+        mpcs = {name: mpc.to_json() for name, mpc in self.mpcs.items()}
+        return {"mpcs": mpcs, "chosen": self.chosen, "models": models}
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """The numbers of the trials."""
+        return {} if self.trials is None else {TRIALS + name: v for name, v in self.trials.to_arrays().items()}
+
+    @classmethod
+    def from_files(cls, data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Candidates:
+        """The inverse of :meth:`to_json` and :meth:`to_arrays`.
+
+        Raises:
+            FileFormatError: If the chosen one is none of them, or the trials are of others.
+        """
+        mpcs = {
+            check_name("candidate", name, error=FileFormatError): MPC.from_json(m) for name, m in data["mpcs"].items()
+        }
+        chosen, models, trials = data["chosen"], data["models"], None
+        if chosen not in mpcs or FULL not in mpcs:
+            raise FileFormatError("candidates", expected="the chosen one and the whole fit", actual=str(chosen))
+        if models is not None:
+            own = {name.removeprefix(TRIALS): v for name, v in arrays.items() if name.startswith(TRIALS)}
+            trials = Trials.from_arrays(tuple(mpcs), tuple(map(str, models)), own)
+        return cls(mpcs, chosen, trials)
+
+
+def tried(
+    nominal: MPC,
+    known: Known,
+    between: Mapping[str, MPC],
+    table: TransitionTable,
+    variants: Callable[[str, MPC], Mapping[str, MPC]],
+    tell: Callable[[int, int, str], None],
+) -> Candidates:
+    """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
+
+    Args:
+        nominal: MPC_1.
+        known: What is known at the end of the fit.
+        between: The MPCs between.
+        table: The transitions as they were logged.
+        variants: Of a good one.
+        tell: Is told how many starts of how many are done, and what is tried.
+    """
+    mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
+    if known.found is None:
+        raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
+    slow = any(quick_policy(mpc).solver.relative_speed < _SLOW for mpc in (nominal, known.mpc))
+    effort = {"n_starts": _FEW_STARTS, "most_steps": _FEW_STEPS, "most_models": _FEW_MODELS} if slow else {}
+    around = surroundings_of(known.mpc, nominal, table, known.found, seed=known.seed, **effort)
+    trials, chosen = choose(mpcs, around, variants, tell)
+    found = Candidates(mpcs, chosen, trials)
+    if chosen == FIRST:
+        logger.warning("%s\n%s", found.finding, found)
+    else:
+        logger.info("%s\n%s", found.finding, found)
+    return found
+
+
+def _different(mpcs: dict[str, MPC]) -> dict[str, MPC]:
+    """Without those that are the same as one before; the whole fit stays by its name."""
+    texts = {name: str(mpc.to_json()) for name, mpc in mpcs.items()}
+    kept: dict[str, MPC] = {}
+    for name, mpc in mpcs.items():
+        others = [texts[FULL], *(texts[other] for other in kept)] if name not in (FIRST, FULL) else []
+        if texts[name] not in others:
+            kept[name] = mpc
+    return kept

@@ -1,0 +1,96 @@
+"""Which of some controllers is best on the models of a log: what is clearly worse leaves early."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.mpc import MPC
+from mpcoffline.solvers import SOLVERS, CompilerError
+
+from .trials import Surroundings, Trials
+
+FIRST = "MPC_1"
+STARTS = 64
+_ROUNDS = (6, 18, 40)  # starts until the end of each; what is left judges
+_CLEAR = 2.0  # standard errors
+
+
+def choose(
+    mpcs: dict[str, MPC],
+    around: Surroundings,
+    variants: Callable[[str, MPC], Mapping[str, MPC]] = lambda name, mpc: {},
+    tell: Callable[[int, int, str], None] = lambda *what: None,
+) -> tuple[Trials, str]:
+    """Tries MPCs on the models of the log and names the best.
+
+    In rounds, each with more starts: after each, those leave that cost clearly more than the best. The best has the
+    least mean cost on the median model, of those that have a vote. It is taken if it costs less than ``"MPC_1"`` from
+    the starts that are left, too, by both regressions of the cost; where no model has a vote, ``"MPC_1"`` stays.
+
+    Args:
+        mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
+        around: Where they are tried; at most two thirds of its starts are used to choose.
+        variants: Of the best one after the first round these are tried, too.
+        tell: Is told how many starts of how many are done, and what is tried.
+
+    Returns:
+        The trials, and the name of the best.
+    """
+    total = len(around.rows)
+    ends = sorted({max(1, round(total * end / STARTS)) for end in _ROUNDS})
+    trials = Trials.none(list(mpcs), around, judged=np.arange(total) >= ends[-1])
+    if not trials.votes.any():
+        return trials, FIRST
+    policies, left, begin = {name: quick_policy(mpc) for name, mpc in mpcs.items()}, list(mpcs), 0
+
+    def act(names: list[str], starts: slice) -> None:
+        for name in names:
+            tell(starts.start, total, name)
+            trials.fill(name, around, policies[name], starts)
+
+    for end in ends:
+        act(left, slice(begin, end))
+        if begin == 0:  # what is better may be better still
+            more = {k: v for name in _still_good(trials, left, end)[:1] for k, v in variants(name, mpcs[name]).items()}
+            mpcs.update(more)
+            policies.update({name: quick_policy(mpc) for name, mpc in more.items()})
+            trials, left = trials.with_names(list(more)), [*left, *more]
+            act(list(more), slice(0, end))
+        left, begin = [FIRST, *_still_good(trials, left, end)], end
+        if left == [FIRST]:
+            break
+    if left == [FIRST]:
+        tell(total, total, "")
+        return trials, FIRST
+    best = left[1]
+    act([FIRST, best], slice(begin, total))
+    tell(total, total, "")
+    return trials, best if trials.improves(best) else FIRST
+
+
+def quick_policy(mpc: MPC) -> MPCPolicy:
+    """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem."""
+    if "ddp" in SOLVERS and not SOLVERS["ddp"].refuses(mpc):
+        policy = MPCPolicy(mpc, "ddp")
+        with contextlib.suppress(CompilerError):
+            _ = policy.solver
+            return policy
+    return MPCPolicy(mpc)
+
+
+def _still_good(trials: Trials, names: list[str], end: int) -> list[str]:
+    """Those, but MPC_1, that are not clearly worse than the best; the best first."""
+    differences = {name: trials.differences(name)[trials.votes][:, :end] for name in names}
+    score = {name: float(np.median(each.mean(axis=1))) for name, each in differences.items()}
+    best = min(names, key=lambda name: score[name])
+
+    def near(name: str) -> bool:
+        gap = differences[name] - differences[best]
+        mean, error = gap.mean(axis=1), gap.std(axis=1) / np.sqrt(end)
+        return bool(np.mean(mean > _CLEAR * error) <= 0.5)
+
+    return sorted((name for name in names if name != FIRST and near(name)), key=lambda name: score[name])
