@@ -51,3 +51,36 @@ def test_the_page_is_written_once_it_is_whole(
     assert f"1 cases are missing, the first {results[-1]['case']!r}" in capsys.readouterr().out
     bench.publish(results, page)
     assert page.read_text() == f"{len(results)} cases\n"
+
+
+def judged(cost: float, verdict: str, simulated: float, expected: tuple[float, float, float]) -> dict[str, Any]:
+    return {
+        "name": "some fit", "verdict": verdict, "reasons": ["why"], "cost": cost, "gain": cost - 100.0,
+        "gain_error": 1.0, "simulated": simulated, "expected": list(expected), "worse_than_today": cost > 120.0,
+    }  # fmt: skip
+
+
+def test_the_page_counts_what_must_not_be(bench: Any) -> None:
+    rest = {
+        "mpc_1": 100.0, "today": 110.0, "fit_error": 0.1, "one_step": {"learned": 0.1}, "outside": 0.0, "growth": 1.0,
+        "seconds": {"fit": 10.0, "diagnose": 5.0},
+    }  # fmt: skip
+    good, bad = (
+        judged(50.0, "recommend", -48.0, (45.0, 52.0, 60.0)),
+        judged(130.0, "recommend", -5.0, (90.0, 95.0, 99.0)),
+    )
+    kept = judged(100.0, "keep MPC_1", 0.0, (90.0, 100.0, 110.0))
+    results = [
+        {"case": "pendulum 1 log default 0", "seed": 0, "handed out": good, **rest},
+        {"case": "pendulum 1 log default 2", "seed": 2, "handed out": kept, "full": bad, **rest},
+    ]
+    page = "\n".join(bench.report_of(results))
+    assert "| worse than MPC_1 | 0 of 2 | 1 of 2 |" in page
+    assert "| recommended, but worse than MPC_1 | 0 | 1; pendulum 1 log default 2 |" in page
+    assert "| better than MPC_1 and recommended | 1 of 1 | 1 of 1 |" in page
+    assert "| worse than the logged controller, and told | 0 of 0 | 1 of 1 |" in page
+    assert "| true cost within the report's band | 2 of 2 | 1 of 2 |" in page
+    assert (
+        "| pendulum 1 log default 2 | 110 | 100 | some fit | 100 | 100 (90 to 110) | keep MPC_1 | 130 | recommend |"
+        in page
+    )

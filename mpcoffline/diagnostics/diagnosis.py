@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.checks import check_integers
+from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, fit_residual, identify, with_residual
@@ -21,6 +24,7 @@ from mpcoffline.mpc.seen import sees_memory
 from mpcoffline.simulation.closed_loop import Simulation, initial_rows, signals_along, simulate
 from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
+from mpcoffline.simulation.trials import Trials
 
 from .figure import Traces
 from .measures import (
@@ -37,7 +41,8 @@ from .measures import (
 from .notes import Fit, notes_on
 from .report import PredictionCheck, Report
 from .stability import TheoremCheck, closed_loop_eigenvalues, leaves_reference, value_growth, weight_checks
-from .verdict import Comparison, decide
+from .verdict import decide
+from .withholding import DEFAULT_RULES, RULES
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -54,6 +59,7 @@ def diagnose(
     n_starts: int | None = None,
     n_steps: int = 100,
     seed: int = 0,
+    rules: Sequence[str] = DEFAULT_RULES,
 ) -> Report:
     """Diagnoses a fit from the log alone.
 
@@ -74,15 +80,19 @@ def diagnose(
             with constraints), which takes minutes even so.
         n_steps: Their length.
         seed: Seeds the ensemble and the choice of starts.
+        rules: Names of the rules that may withhold a recommendation, of ``mpcoffline.diagnostics.withholding.RULES``.
 
     Returns:
         The report.
 
     Raises:
         MPCOfflineError: If the learner was not fitted.
+        UnknownIdError: For a rule that there is none of.
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     check_integers(1, n_steps=n_steps, **({} if n_starts is None else {"n_starts": n_starts}))
+    for name in rules:
+        check_known("rule", name, RULES)
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
@@ -101,15 +111,25 @@ def diagnose(
     rows = initial_rows(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
     starts, signals = clean.take(rows).values().observations, signals_along(clean, rows, n_steps, learned.layout)
     first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps, signals) for policy in policies)
-    comparison = Comparison.of(first, second, cost.r2)
     lag = lag_check(identified, clean)
-    verdict, reasons = decide(comparison, lag, found.noise, len(table))
+    failed = (policies[0].solver_stats.failed_share, policies[1].solver_stats.failed_share)
+    trials = _trials(first, second, ensemble, cost, table, rows, n_steps)
+    judgement = decide(
+        trials,
+        "learned",
+        lag=lag,
+        noise=found.noise,
+        n_rows=len(table),
+        cost_r2=cost.r2,
+        failed=failed[1],
+        rules=tuple(rules),
+    )
     reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
     report = Report(
-        verdict=verdict,
-        reasons=reasons,
+        judgement=judgement,
+        trials=trials,
         notes=(),
-        comparison=comparison,
+        cost_r2=cost.r2,
         value=value_check(learner.value_function, clean, learned.discount),
         fit=fit_errors(nominal, learned, learner.value_function, clean, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
@@ -120,7 +140,7 @@ def diagnose(
         lag=lag,
         noise=found.noise,
         goal=goal_check(nominal, clean),
-        failed_solves=(policies[0].solver_stats.failed_share, policies[1].solver_stats.failed_share),
+        failed_solves=failed,
         findings=learner.findings,
         n_rows=len(table),
         n_episodes=table.n_episodes,
@@ -134,6 +154,41 @@ def diagnose(
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
     fit = Fit(learner.method.options.get("init") == "identified", learner.learn == "cost+model", not cost_kept)
     return report.with_notes(notes_on(report, fit))
+
+
+def _trials(
+    first: Simulation,
+    second: Simulation,
+    ensemble: Ensemble,
+    cost: LoggedCost,
+    table: TransitionTable,
+    rows: NDArray[np.intp],
+    n_steps: int,
+) -> Trials:
+    """Both simulations side by side."""
+    costs = np.stack([first.cost, second.cost]) + n_steps * cost.low
+    return Trials(
+        names=("MPC_1", "learned"),
+        models=("identified", *(f"variation {k}" for k in range(1, len(ensemble)))),
+        votes=np.ones(len(ensemble), dtype=bool),
+        cost=costs,
+        second=costs,
+        lost=np.stack([first.lost, second.lost]),
+        rows=rows,
+        returns=_logged_costs(table, rows, n_steps),
+        judged=np.ones(len(rows), dtype=bool),
+        n_steps=n_steps,
+    )
+
+
+def _logged_costs(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) -> Array:
+    """What the log cost from these rows over so many steps, ``(starts,)``; NaN where an episode ends before."""
+    ends = table.episode_ids
+    found = np.full(len(rows), np.nan)
+    for i, row in enumerate(rows):
+        if row + n_steps <= len(table) and ends[row] == ends[row + n_steps - 1]:
+            found[i] = table.take(slice(int(row), int(row) + n_steps)).costs.astype(np.float64).sum()
+    return found
 
 
 def _completed(found: Identification, identified: MPC, seed: int) -> tuple[Identification, MPC]:

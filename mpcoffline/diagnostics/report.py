@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import textwrap
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,11 +15,13 @@ from mpcoffline.core.archive import plain
 from mpcoffline.core.text import listed
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.plotting import save_figure
+from mpcoffline.simulation.trials import Trials
 
+from .differences import TODAY, candidates
 from .figure import Traces, draw
 from .measures import GoalCheck, LagCheck, RegionError, ValueCheck
 from .stability import TheoremCheck, WeightCheck
-from .verdict import Comparison, Verdict
+from .verdict import Judgement, Verdict, costs_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,10 +53,10 @@ class Report:
     Only the simulations decide the verdict; the other figures explain it, and rank fits badly on their own.
 
     Attributes:
-        verdict: ``"recommend"``, ``"try with care"`` or ``"keep MPC_1"``.
-        reasons: Why, and what to do; the decisive one first.
+        judgement: The verdict and what it rests on.
+        trials: All controllers that were tried, on models of the log.
         notes: What else the user should know, and what to do about it.
-        comparison: Both controllers on an ensemble of models identified from the log.
+        cost_r2: Share of the logged costs' variance that the simulated cost explains.
         value: V_phi against measured returns.
         fit: The regression error of (FIT) before and after, by region.
         prediction: One-step prediction errors.
@@ -72,10 +74,10 @@ class Report:
         traces: What the figure shows besides; not in the JSON form.
     """
 
-    verdict: Verdict
-    reasons: tuple[str, ...]
+    judgement: Judgement
+    trials: Trials
     notes: tuple[str, ...]
-    comparison: Comparison
+    cost_r2: float
     value: ValueCheck
     fit: tuple[RegionError, ...]
     prediction: PredictionCheck
@@ -92,19 +94,26 @@ class Report:
     n_episodes: int
     traces: Traces = field(repr=False, compare=False)
 
+    @property
+    def verdict(self) -> Verdict:
+        """``"recommend"``, ``"try with care"`` or ``"keep MPC_1"``."""
+        return self.judgement.verdict
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why, and what to do; the decisive one first."""
+        return self.judgement.reasons
+
     def __str__(self) -> str:
         """The report as plain text."""
-        c, p, ratios = self.comparison, self.prediction, np.array(self.comparison.ratios)
-        lines = [f"Verdict: {self.verdict}", *map(_item, self.reasons)]
+        p = self.prediction
+        lines = [f"Verdict: {self.verdict}", *map(_item, self.reasons), *self._costs(), *self._candidates()]
         for title, items in (("Notes", self.notes), ("What the fit found", self.findings)):
             lines += [title, *map(_item, items)] if items else []
         rows = [
             ("data", f"{self.n_rows} rows, {self.n_episodes} episodes"),
-            ("models, starts, steps", f"{len(ratios)}, {c.n_starts}, {c.n_steps}"),
-            ("cost relative to MPC_1", f"{ratios[0]:.3f} identified, {ratios.min():.3f} to {ratios.max():.3f} all"),
-            ("episodes that end well", f"{c.nominal_success[0]:.0%} MPC_1, {c.learned_success[0]:.0%} learned"),
             ("failed solves", "{:.2%} MPC_1, {:.2%} learned".format(*self.failed_solves)),
-            ("R2 of the simulated cost", f"{c.cost_r2:.4f}"),
+            ("R2 of the simulated cost", f"{self.cost_r2:.4f}"),
             ("V against returns", self._value_text()),
             *((f"(FIT) error, {part.name}", f"{part.before:.3g} before, {part.after:.3g} after") for part in self.fit),
             ("one-step error", f"{p.nominal:.3g} MPC_1, {p.identified:.3g} identified, {p.learned:.3g} learned"),
@@ -114,7 +123,7 @@ class Report:
             ("closed-loop eigenvalues", _numbers(self.theorem.eigenvalues) or "unknown"),
             *((f"eigenvalues of {w.name}", f"{_numbers(w.before)} before, {_numbers(w.after)} after")
               for w in self.weights),
-            ("parameters at bounds", listed(self.at_bounds) or "none"),
+            ("parameters at bounds", listed(self.at_bounds, 3) or "none"),
             ("measurement noise", f"{self.noise.level:.1%} of the states' spread ({self.noise.source})"),
             ("effect of past inputs", f"{self.lag.share:.1%} of the present one's"),
             ("logged states near the goal", "unknown" if self.goal is None else f"{self.goal.share:.2%}"),
@@ -126,6 +135,45 @@ class Report:
         """The same report with notes."""
         return replace(self, notes=notes)
 
+    def _costs(self) -> list[str]:
+        """Today, MPC_1 and the proposal, and how far models and log agree, which says how far to trust the rest."""
+        t, today = self.trials, self.judgement.today
+        rows: list[tuple[str, ...]] = [("", "lowest", "expected", "highest")]
+        for name, cost in costs_of(self.judgement, t):
+            known = bool(np.isfinite(cost).any())
+            rows.append(
+                (name, *(f"{value:.4g}" if np.isfinite(value) else "?" for value in cost))
+                if known
+                else (name, "", "?", "")
+            )
+        title = f"Cost of an episode of {t.n_steps} steps, {len(t.rows)} starts"
+        voting = f"{int(t.votes.sum())} of {len(t.models)} models predict the log well enough to be asked"
+        agree = today.disagreement[np.isfinite(today.disagreement)]
+        if len(agree) and np.isfinite(today.logged_spread) and today.logged_spread > 0.0:
+            share = float(np.median(np.abs(agree))) / today.logged_spread
+            voting += (
+                f"; on them a clone of the logged controller costs {today.logged + agree.min():.4g} to"
+                f" {today.logged + agree.max():.4g}, in the log {today.logged:.4g}: they are"
+                f" {share:.2g} of the episodes' spread apart"
+            )
+        return [title, *_columns(rows), _item(f"{voting}.")]
+
+    def _candidates(self) -> list[str]:
+        """What was tried, the cheapest first."""
+        rows: list[tuple[str, ...]] = [("", "minus MPC_1", "models that agree", "lost")]
+        for each in candidates(self.trials):
+            name = f"{each.name} (clone)" if each.name == TODAY else each.name
+            chosen = f"{name} *" if each.name == self.judgement.proposal else name
+            rows.append(
+                (
+                    chosen,
+                    f"{each.difference:+.3g} +- {2.0 * each.error:.2g}",
+                    f"{each.agree} of {each.of}",
+                    f"{each.lost:.1%}",
+                )
+            )
+        return ["Candidates (* is judged)", *_columns(rows)] if len(rows) > 1 else []
+
     def _value_text(self) -> str:
         v = self.value
         if not v.n:
@@ -134,18 +182,29 @@ class Report:
 
     def to_json(self) -> str:
         """The report as JSON text; what is not finite becomes null."""
-        data = {name: value for name, value in asdict(self).items() if name != "traces"}
-        data["comparison"] |= {"ratios": list(self.comparison.ratios), "limit": self.comparison.limit}
+        fields = ("trials", "traces", "judgement")
+        judgement = {name: value for name, value in vars(self.judgement).items() if name not in ("first", "today")}
+        data = judgement | {name: value for name, value in vars(self).items() if name not in fields}
+        data = {name: _as_data(value) for name, value in data.items()}
+        t = self.trials
+        data["costs"] = {name: list(cost) for name, cost in costs_of(self.judgement, t)}
+        data["candidates"] = [asdict(each) for each in candidates(t)]
+        data["difference"] = _as_data(self.judgement.first)
+        data["today"] = _as_data(self.judgement.today)
+        data["trials"] = {
+            "models": t.models, "votes": t.votes, "starts": len(t.rows), "steps": t.n_steps,
+            "cost": {name: t.of(name).mean(axis=1) for name in t.names},
+        }  # fmt: skip
         data["noise"] |= {"level": self.noise.level}
         return json.dumps(plain(data), indent=2, allow_nan=False)
 
     def plot(self) -> Figure:
-        """Draws the report: relative costs on the models, closed loops, V against returns, and the error of (FIT).
+        """Draws the report: candidates, costs, models against the log, closed loops, V against returns, error of (FIT).
 
         Returns:
             The figure; a notebook shows it.
         """
-        return draw(self.verdict, self.comparison, self.value, self.fit, self.traces)
+        return draw(self.judgement, self.trials, self.value, self.fit, self.traces)
 
     def figure(self, path: str | PathLike[str]) -> list[Path]:
         """Writes :meth:`plot`.
@@ -157,6 +216,22 @@ class Report:
             The files.
         """
         return save_figure(self.plot(), Path(path))
+
+
+def _as_data(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_as_data(each) for each in value]
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+
+
+def _columns(rows: list[tuple[str, ...]]) -> list[str]:
+    """A small table: names to the left, figures to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  "
+        + "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]).rstrip()
+        for row in rows
+    ]
 
 
 def _item(text: str) -> str:

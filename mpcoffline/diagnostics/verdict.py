@@ -1,157 +1,281 @@
-"""The verdict: is the learned controller better than MPC_1 on the models that the log leaves possible?"""
+"""The verdict: is the proposed controller better than MPC_1, and than what runs today, on the models of the log?"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from mpcoffline.core.text import listed
+from mpcoffline.core.types import Array
 from mpcoffline.estimation.smoothing import NoiseEstimate
-from mpcoffline.simulation.closed_loop import Simulation
+from mpcoffline.simulation.trials import Trials
 
+from .differences import SURE, TODAY, Difference, Today, judged, outvoted, paired
 from .measures import LagCheck
+from .withholding import DEFAULT_RULES, RULES, Evidence, gone_wrong
 
 Verdict = Literal["recommend", "try with care", "keep MPC_1"]
 
-_WORST = 0.98  # the largest relative cost of any member that may be recommended
-_DISAGREEMENT = 0.5  # what is asked for besides, per log(max / min) of the members
-_CARE = 0.95  # relative cost with the identified model below which a trial is worth it
-_BELOW = 0.1  # of the range of all mean costs
-_MUCH_NOISE = 0.12  # of the states' spread
-_FEW_ROWS = 500
-_LITTLE_NOISE = 0.02  # where rows are few
-_COST_R2 = 0.9
-
-_UNDECIDED = "and {:.3g} times as much as on the best: models that disagree so much allow no recommendation"
+_LEAST = 0.005  # of the spread of MPC_1's costs over the starts: a smaller gain is none
+_MANY_STARTS = 2_000
+_ALIKE = 2.0  # models whose gains differ by less than this factor give it a size
+_FAILED = 0.01
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Both controllers on the ensemble; entry 0 of each is the identified model.
+class Judgement:
+    """A verdict and what it rests on.
 
     Attributes:
-        nominal_cost: Mean cost of MPC_1 above the cheapest logged cost, ``(members,)``.
-        learned_cost: The same of the learned MPC.
-        nominal_success: Share of the starts from which MPC_1 ends at low cost, ``(members,)``.
-        learned_success: The same of the learned MPC.
-        lost: Share of the learned MPC's episodes that ran away.
-        n_starts: Starts.
-        n_steps: Steps of an episode.
-        cost_r2: Share of the logged costs' variance that the cost used here explains.
+        verdict: ``"recommend"``, ``"try with care"`` or ``"keep MPC_1"``.
+        reasons: Why, and what would change it; the decisive one first.
+        proposal: The controller that was judged.
+        first: Its cost minus that of MPC_1; None where no model has a vote.
+        today: It against the controller that made the log.
+        expected: Lowest, middle and highest mean cost of an episode that the models, and today's cost with the
+            difference to today, let expect; NaN where no model has a vote.
     """
 
-    nominal_cost: tuple[float, ...]
-    learned_cost: tuple[float, ...]
-    nominal_success: tuple[float, ...]
-    learned_success: tuple[float, ...]
-    lost: float
-    n_starts: int
-    n_steps: int
-    cost_r2: float
-
-    @classmethod
-    def of(cls, nominal: Simulation, learned: Simulation, cost_r2: float) -> Comparison:
-        """From the simulations of both."""
-        # A controller may become cheaper than anything logged, and costs have no zero of their own: then ratios are
-        # taken from a tenth of the range below the cheapest of both.
-        low, high = (float(f([f(each.mean_cost) for each in (nominal, learned)])) for f in (np.min, np.max))
-        low = 0.0 if low >= 0.0 else low - _BELOW * (high - low)
-        floor = 1e-9 * max(float(nominal.mean_cost.max()), 1e-300)
-        return cls(
-            nominal_cost=tuple(float(v) for v in np.maximum(nominal.mean_cost - low, floor)),
-            learned_cost=tuple(float(v) for v in np.maximum(learned.mean_cost - low, floor)),
-            nominal_success=tuple(float(v) for v in nominal.success.mean(axis=1)),
-            learned_success=tuple(float(v) for v in learned.success.mean(axis=1)),
-            lost=float(learned.lost.mean()),
-            n_starts=nominal.cost.shape[1],
-            n_steps=nominal.actions.shape[1],
-            cost_r2=cost_r2,
-        )
-
-    @property
-    def ratios(self) -> tuple[float, ...]:
-        """Cost of the learned MPC over that of MPC_1, a member each."""
-        return tuple(b / a for a, b in zip(self.nominal_cost, self.learned_cost, strict=True))
-
-    @property
-    def spread(self) -> float:
-        """How much the members disagree: log(max / min) of :attr:`ratios`."""
-        return float(np.log(max(self.ratios) / min(self.ratios)))
-
-    @property
-    def limit(self) -> float:
-        """The largest ratio of any member that may be recommended; 0, so none, where they disagree too much."""
-        return max(0.0, min(_WORST, 1.0 - _DISAGREEMENT * self.spread))
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    proposal: str
+    first: Difference | None
+    today: Today
+    expected: tuple[float, float, float]
 
 
-def decide(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_rows: int) -> tuple[Verdict, tuple[str, ...]]:
+@np.errstate(invalid="ignore")  # of costs that are not finite nothing follows
+def decide(
+    trials: Trials,
+    proposal: str,
+    *,
+    lag: LagCheck | None = None,
+    noise: NoiseEstimate | None = None,
+    n_rows: int | None = None,
+    cost_r2: float = 1.0,
+    failed: float = 0.0,
+    rules: tuple[str, ...] = DEFAULT_RULES,
+) -> Judgement:
     """The verdict and why.
 
-    Recommended is a learned MPC that costs less than MPC_1 on every member, by a margin that grows with their
-    disagreement, and succeeds no less often. The rule cannot see what all members have in common: where inputs act
-    late, where noise is strong, or rows are few and noisy, nothing is recommended.
+    All figures are differences of costs of the same start on the same model, in the unit of the logged cost; only
+    models with a vote count. Recommended is a controller that is cheaper than MPC_1 beyond two standard errors, by both
+    regressions of the cost, on all of them but one (of four or more: an outlier is named, not obeyed), and cheaper than
+    what runs today by more than models and log disagree about that, unless a rule withholds it. Costs ``a L + b`` with
+    a > 0 give the verdict of L.
 
     Args:
-        comparison: Both controllers on the ensemble.
-        lag: Whether inputs act late.
-        noise: Measurement noise.
-        n_rows: Transitions in the data.
+        trials: MPC_1, the proposal, perhaps the clone of today's controller, on the models of the log.
+        proposal: Name of the controller that is judged; ``"MPC_1"`` where nothing better was found.
+        lag: Whether inputs act late, for the rule of that name.
+        noise: Measurement noise, likewise.
+        n_rows: Transitions in the data, likewise.
+        cost_r2: Share of the logged costs' variance that the simulated cost explains, likewise.
+        failed: Share of the proposal's problems that were not solved at first.
+        rules: Names of the rules of :data:`RULES` that may withhold a recommendation.
 
     Returns:
-        The verdict, and its reasons with what to do, the decisive one first.
+        The judgement.
     """
-    c, withheld = comparison, _withheld(comparison, lag, noise, n_rows)
-    worst, first = max(c.ratios), c.ratios[0]
-    fewer = [learned < nominal for nominal, learned in zip(c.nominal_success, c.learned_success, strict=True)]
-    if worst < c.limit and not any(fewer) and not withheld:
-        least, most = 100.0 * (1.0 - worst), 100.0 * (1.0 - min(c.ratios))
-        text = (
-            f"Better on models of your data: {least:.0f} % to {most:.0f} % less cost than MPC_1 on all"
-            f" {len(c.ratios)} of them. The plant may still differ: begin with supervised trials."
-        )
-        return "recommend", (text,)
-    doubts = list(withheld)
-    if any(fewer):
-        doubts.append(
-            f"On {sum(fewer)} of {len(fewer)} models fewer episodes end at low cost than with MPC_1: look at these"
-            " closed loops before any trial."
-        )
-    if first >= _CARE:
-        doubts.insert(0, f"{first:.2f} times the cost of MPC_1 on the identified model is no clear gain: keep MPC_1.")
-        return "keep MPC_1", tuple(doubts)
-    if worst >= c.limit:
-        asked = f"where less than {c.limit:.2f} is asked for" if c.limit > 0.0 else _UNDECIDED.format(np.exp(c.spread))
-        doubts.append(
-            f"{first:.2f} times the cost of MPC_1 on the identified model, but {worst:.2f} times on the worst of"
-            f" {len(c.ratios)}, {asked}: record more data where the models disagree."
-        )
-    return ("keep MPC_1" if fewer[0] else "try with care"), tuple(doubts)
+    if not trials.votes.any() and "no model predicts" not in rules:
+        trials = replace(trials, votes=np.ones_like(trials.votes))
+    evidence = Evidence(trials, proposal, lag, noise, n_rows, cost_r2)
+    doubts = [text for name in rules if (text := RULES[name](evidence)) is not None]
+    today, expected = Today.of(trials, proposal), _expected(trials, proposal)
+    if not trials.votes.any():
+        return Judgement("keep MPC_1", tuple(doubts), proposal, None, today, expected)
+    if proposal == trials.names[0]:
+        reasons = (_nothing_better(trials), *_of_today(today, trials, proposal))
+        return Judgement("keep MPC_1", reasons, proposal, Difference.of(trials, proposal, proposal), today, expected)
+    first = Difference.of(trials, proposal, trials.names[0])
+    told = [*_of_today(today, trials, proposal), *gone_wrong(evidence), *_failures(failed)]
+    if not _gains(first, trials):
+        return Judgement("keep MPC_1", (_no_gain(first, trials), *told, *doubts), proposal, first, today, expected)
+    if today.known and today.worse:
+        return Judgement("keep MPC_1", (*told, _gain(first, trials), *doubts), proposal, first, today, expected)
+    clear = first.agreed and not doubts and (today.better or not today.known)
+    reasons = (_gain(first, trials), *_objections(first, trials), *doubts, *told)
+    if clear:
+        reasons = (*reasons, _to_see(expected))
+    return Judgement("recommend" if clear else "try with care", reasons, proposal, first, today, expected)
 
 
-def _withheld(comparison: Comparison, lag: LagCheck, noise: NoiseEstimate, n_rows: int) -> tuple[str, ...]:
-    """Why nothing may be recommended, whatever the simulations say."""
-    reasons = []
-    if lag.found:
-        reasons.append(
-            f"Inputs act late (past ones move the state {100 * lag.share:.0f} % as much as present ones), which no"
-            " model here knows: give the model their dead time (Model(..., delay=)), or the actuator's own state."
+def _gains(first: Difference, trials: Trials) -> bool:
+    """Whether the median model says that the controller is cheaper, beyond two standard errors and a trifle."""
+    k = first.middle
+    gain = -first.mean[k] - SURE * first.error[k]
+    return bool(gain > 0.0 and -first.mean[k] > _LEAST * _spread(trials, trials.names[0], k))
+
+
+def _spread(trials: Trials, name: str, k: int) -> float:
+    """Standard deviation over the starts of a controller's cost on voting model k."""
+    costs = trials.of(name)[trials.votes][k][judged(trials)]
+    return float(np.nanstd(costs)) if np.isfinite(costs).any() else 0.0
+
+
+def _level(trials: Trials, name: str, k: int) -> float:
+    """Mean cost on voting model k."""
+    costs = trials.of(name)[trials.votes][k][judged(trials)]
+    return float(np.nanmean(costs)) if not np.isnan(costs).all() else np.nan
+
+
+def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
+    """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts."""
+    costs = trials.of(proposal)[trials.votes]
+    mean, error = paired(costs, np.zeros_like(costs))
+    known = np.isfinite(mean) & np.isfinite(error)
+    if not known.any():
+        return np.nan, np.nan, np.nan
+    order, out = np.sort(mean[known]), outvoted(int(known.sum()))
+    kept, doubt = order[out : len(order) - out], SURE * float(np.median(error[known]))
+    ends = [float(kept[0]) - doubt, float(kept[-1]) + doubt]
+    today = Today.of(trials, proposal)
+    if today.known and np.isfinite(today.logged):
+        ends += [today.logged + each for each in today.middle]
+    return min(ends), float(np.median(order)), max(ends)
+
+
+# ---------------------------------------------------------------- sentences
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"
+
+
+def _pair(mean: float, error: float) -> str:
+    return f"{mean:.3g} +- {SURE * error:.2g}" if np.isfinite(error) else f"{mean:.3g} (from too few starts)"
+
+
+def _gain(first: Difference, trials: Trials) -> str:
+    """By how much the median model says that it is better; a size only where the models agree about it."""
+    k, n = first.middle, len(first)
+    levels = " -> ".join(_number(_level(trials, name, k)) for name in (trials.names[0], first.name))
+    kept = np.sort(first.mean)[: n - outvoted(n)]  # but for the one that is dearest
+    alike = kept[-1] < 0.0 and kept[0] / kept[-1] < _ALIKE
+    size = "" if alike else f" The models do not agree about the size ({kept[0]:.3g} to {kept[-1]:.3g})."
+    return (
+        f"{first.name} costs {_pair(-first.mean[k], first.error[k])} less than {trials.names[0]} an episode of"
+        f" {trials.n_steps} steps ({levels}, median model, {int(judged(trials).sum())} starts), beyond two standard"
+        f" errors on {int(first.better.sum())} of {n} models that predict the log.{size}"
+    )
+
+
+def _no_gain(first: Difference, trials: Trials) -> str:
+    k = first.middle
+    mean, error, n = first.mean[k], first.error[k], int(judged(trials).sum())
+    if np.isnan(mean):
+        return f"{first.name} could not be simulated from any start: nothing is known of it."
+    if mean - SURE * error > 0.0:
+        return (
+            f"{first.name} costs {_pair(mean, error)} more than {trials.names[0]} an episode of {trials.n_steps} steps"
+            f" on the median model: dearer beyond two standard errors on {int(first.worse.sum())} of {len(first)}. Look"
+            " at the candidates for another one, or record data where the learned MPC goes."
         )
-    if noise.level > _MUCH_NOISE:
-        reasons.append(
-            f"Measurement noise is {100 * noise.level:.0f} % of the states' spread; all models share its bias: filter"
-            " the measurements before logging."
+    text = (
+        f"{first.name} costs {_pair(abs(mean), error)} {'less' if mean < 0.0 else 'more'} than {trials.names[0]} an"
+        f" episode of {trials.n_steps} steps on the median model: no clear gain."
+    )
+    if mean + SURE * error < 0.0:
+        return f"{text} It is less than {_LEAST:.1%} of how much the starts differ: both are as good."
+    needed = n * (SURE * error / abs(mean)) ** 2 if mean < 0.0 else np.inf
+    if needed < _MANY_STARTS:
+        return f"{text} About {int(np.ceil(needed / 10.0)) * 10} starts would decide (n_starts=)."
+    return text
+
+
+def _nothing_better(trials: Trials) -> str:
+    """Why the learner handed out MPC_1."""
+    others = [name for name in trials.names[1:] if name != TODAY]
+    tried = [Difference.of(trials, name, trials.names[0]) for name in others]
+    if not tried:
+        return f"{trials.names[0]} is the only candidate."
+    best = min(tried, key=lambda each: np.nan_to_num(each.mean[each.middle], nan=np.inf))
+    k = best.middle
+    sign = "less" if best.mean[k] < 0.0 else "more"
+    return (
+        f"Nothing that was learned is clearly better than {trials.names[0]}: the best of {len(tried)} candidates,"
+        f" {best.name}, costs {_pair(abs(best.mean[k]), best.error[k])} {sign} an episode on the median model."
+    )
+
+
+def _objections(first: Difference, trials: Trials) -> tuple[str, ...]:
+    """Models that do not agree, by name, and what to do where they are more than one."""
+    objecting = np.flatnonzero(~first.better)
+    if not len(objecting):
+        return ()
+    names = listed([f"{first.models[k]} ({first.mean[k]:+.3g})" for k in objecting], 4)
+    if first.agreed:
+        return (f"One of {len(first)} models says otherwise, {names}: an outlier, named and not obeyed.",)
+    by_cost = (first.mean + SURE * first.error < 0.0) & ~first.better
+    if by_cost.sum() > len(objecting) / 2:
+        return (
+            f"With the other regression of the logged cost the gain is not clear on {int(by_cost.sum())} of"
+            f" {len(first)} models: what is gained may be an error of the cost that is simulated. Write the plant's"
+            " stage cost as that of the MPC; it is used as it is where it agrees with the log.",
         )
-    elif noise.level > _LITTLE_NOISE and n_rows < _FEW_ROWS:
-        reasons.append(f"Only {n_rows} rows, with {100 * noise.level:.0f} % measurement noise: record more.")
-    if comparison.cost_r2 < _COST_R2:
-        reasons.append(
-            f"The logged cost is hardly a function of state and input (R2 {comparison.cost_r2:.2f}): check that the"
-            " state holds all that the cost depends on."
+    return (
+        f"{len(objecting)} of {len(first)} models do not confirm it: {names}. More starts (n_starts=) where their"
+        " differences are small; else record data where the learned MPC goes, by trials under supervision, and fit"
+        " again.",
+    )
+
+
+def _of_today(today: Today, trials: Trials, name: str) -> tuple[str, ...]:
+    """The comparison with the controller that made the log, and MPC_1's where that is worse than today's, too."""
+    if not today.known:
+        return (
+            (f"What runs today cannot be compared: no logged episode is {trials.n_steps} steps long (n_steps=).",)
+            if len(today.low)
+            else ()
         )
-    if comparison.lost > 0.0:
-        reasons.append(
-            f"In {100 * comparison.lost:.0f} % of the simulated episodes the state ran away: restrict the inputs, or"
-            " record data there."
+    low, high = today.middle
+    logged = f"what runs today ({_number(today.logged)} in the log)" if np.isfinite(today.logged) else "what runs today"
+    span = f"{low:+.3g} to {high:+.3g}"
+    if today.better:
+        return (f"{name} is better than {logged}: {span} an episode.",)
+    worse, also = today.worse, ""
+    if worse or today.dearer:
+        also = " MPC_1 is, too." if name != trials.names[0] and Today.of(trials, trials.names[0]).dearer else ""
+    if worse:
+        return (
+            f"{name} is worse than {logged}: {span} an episode, whether by the log or by a clone.{also} Keep that.",
         )
-    return tuple(reasons)
+    if np.isfinite(today.disagreement).any():
+        gap = float(np.nanmedian(today.disagreement))
+        why = (
+            f"on the models a clone of that controller costs {gap:+.3g} of what was logged. A model that explains this"
+            " would decide"
+        )
+    else:
+        why = "more episodes in the log would decide"
+    rather = " It is rather worse." if today.dearer else ""
+    return (f"{name} against {logged}: {span} an episode, which is not clear; {why}.{rather}{also}",)
+
+
+def _failures(failed: float) -> tuple[str, ...]:
+    if failed <= _FAILED:
+        return ()
+    return (
+        f"{failed:.1%} of its problems were not solved at first in these simulations, where a plan at hand was"
+        " applied. Smooth what has corners in the model, or rescue='ipopt'.",
+    )
+
+
+def _to_see(expected: tuple[float, float, float]) -> str:
+    low, middle, high = expected
+    return (
+        f"The plant may still differ: begin with supervised trials. Expected is a mean of {_number(middle)} an episode,"
+        f" {_number(low)} to {_number(high)} by what models and log say; more than that would contradict them."
+    )
+
+
+def costs_of(judgement: Judgement, trials: Trials) -> tuple[tuple[str, Array], ...]:
+    """Today, MPC_1 and the proposal: lowest, middle and highest mean cost of an episode, ``(3,)`` each."""
+    today = judgement.today
+    rows = [("today", today.logged + SURE * today.logged_error * np.array([-1.0, 0.0, 1.0]))]
+    rows.append((trials.names[0], np.array(_expected(trials, trials.names[0]))))
+    if judgement.proposal != trials.names[0]:
+        rows.append((judgement.proposal, np.array(judgement.expected)))
+    return tuple(rows)

@@ -1,0 +1,117 @@
+"""A report with invented numbers: its text, its JSON form, its picture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from invented_trials import trials
+
+from mpcoffline.diagnostics import Report
+from mpcoffline.diagnostics.figure import Traces
+from mpcoffline.diagnostics.measures import GoalCheck, LagCheck, RegionError, ValueCheck
+from mpcoffline.diagnostics.report import PredictionCheck
+from mpcoffline.diagnostics.stability import TheoremCheck, WeightCheck
+from mpcoffline.diagnostics.verdict import decide
+from mpcoffline.estimation.smoothing import NoiseEstimate
+from mpcoffline.simulation.trials import Trials
+
+GAINS = {
+    "full fit": [52.0, 50.0, 55.0, 51.0, 53.0, 49.0, 54.0, -400.0],
+    "identified + V": [30.0, 28.0, 33.0, 31.0, 20.0, 29.0, 30.0, 31.0],
+    "identified + nominal cost": [10.0, -3.0, 12.0, 11.0, 9.0, 9.0, 10.0, 11.0],
+}
+
+
+def report_of(tried: Trials, name: str = "full fit") -> Report:
+    """Of trials; everything else is made up."""
+    rng = np.random.default_rng(0)
+    states = np.cumsum(rng.normal(size=(8, 51, 2)), axis=1) * np.exp(-0.1 * np.arange(51))[:, None]
+    value = np.sort(rng.normal(size=(2, 100)), axis=1)
+    return Report(
+        judgement=decide(tried, name),
+        trials=tried,
+        notes=("A note.",),
+        cost_r2=0.998,
+        value=ValueCheck(100, 0.9, -0.1, 0.05, 0.9),
+        fit=tuple(RegionError(part, 0.5, 0.01) for part in ("all data", "V lowest quarter", "V highest quarter")),
+        prediction=PredictionCheck(0.5, 0.01, 0.02, ()),
+        theorem=TheoremCheck(0.8, 0.02, (0.9, 0.5)),
+        weights=(WeightCheck("W", (0.1, 1.0), (0.2, 2.0)),),
+        at_bounds=tuple(f"model.a[{i}]" for i in range(40)),
+        outside_support=0.01,
+        lag=LagCheck(0.01, 0.5),
+        noise=NoiseEstimate(np.zeros(2), np.zeros(2), np.ones(2), "repeated"),
+        goal=GoalCheck(0.1, False),
+        failed_solves=(0.0, 0.001),
+        findings=("Logged cost: known.",),
+        n_rows=10_000,
+        n_episodes=100,
+        traces=Traces(states, 0.5 * states, value, np.zeros(2)),
+    )
+
+
+GOOD = trials(GAINS, today=140.0, clone=136.0, spread=30.0, noise=8.0)
+
+
+def test_the_text_has_the_table_the_candidates_and_how_far_models_and_log_agree() -> None:
+    text = str(report_of(GOOD))
+    lines = text.splitlines()
+    assert lines[0] == "Verdict: recommend"
+    table = lines[lines.index("Cost of an episode of 50 steps, 64 starts") + 1 :]
+    assert [line.split()[0] for line in table[1:4]] == ["today", "MPC_1", "full"]
+    assert (
+        "8 of 8 models predict the log well enough to be asked; on them a clone of the logged controller"
+        in " ".join(text.split())
+    )
+    tried = lines[lines.index("Candidates (* is judged)") + 1 :]
+    assert tried[1].split()[:3] == ["full", "fit", "*"]
+    assert "7 of 8" in tried[1]
+    assert tried[4].split()[:2] == ["today", "(clone)"]
+    assert "model.a[2] and 37 more" in text
+    assert all(len(line) < 100 for line in lines)
+
+
+def test_the_json_form_says_the_same() -> None:
+    found = report_of(GOOD)
+    data = json.loads(found.to_json())
+    assert data["verdict"] == "recommend"
+    assert data["proposal"] == "full fit"
+    assert data["reasons"] == list(found.reasons)
+    assert data["costs"]["today"][1] == pytest.approx(140.0)
+    assert data["candidates"][0]["name"] == "full fit"
+    assert data["candidates"][0]["agree"] == 7
+    assert len(data["difference"]["mean"]) == 8
+    assert data["today"]["logged"] == pytest.approx(140.0)
+    assert data["trials"]["cost"]["MPC_1"][0] == pytest.approx(GOOD.cost[0, 0].mean())
+    assert data["value"]["correlation"] == 0.9
+    assert data["theorem"]["eigenvalues"] == [0.9, 0.5]
+    assert "traces" not in data
+
+
+@pytest.mark.parametrize(
+    ("tried", "name"),
+    [
+        (GOOD, "MPC_1"),
+        (trials({"full fit": [1.0]}, n_starts=1), "full fit"),
+        (trials({"full fit": [1.0, 2.0]}, votes=[False, False], today=50.0), "full fit"),
+        (replace(GOOD, cost=np.full_like(GOOD.cost, np.nan), second=np.full_like(GOOD.cost, np.inf)), "full fit"),
+    ],
+)
+def test_whatever_came_of_the_trials_there_is_a_report(tried: Trials, name: str) -> None:
+    found = report_of(tried, name)
+    assert str(found).startswith("Verdict: ")
+    data: dict[str, Any] = json.loads(found.to_json())
+    assert data["verdict"] == "keep MPC_1"
+    assert data["reasons"]
+    assert len(found.plot().axes) == 6
+
+
+def test_the_figure_is_written(tmp_path: Path) -> None:
+    files = report_of(GOOD).figure(tmp_path / "report.png")
+    assert [file.name for file in files] == ["report.pdf", "report.png"]
+    assert all(file.stat().st_size > 10_000 for file in files)
