@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from .trials import Surroundings, Trials
 
 FIRST = "MPC_1"
 STARTS = 64
+_SLOW = 10.0  # times as fast as ipopt
 _ROUNDS = (8, 20, 40)  # starts until the end of each; what is left judges
 _CLEAR = 2.0  # standard errors
 _VARIED = 3  # of the best, variants are tried
@@ -72,6 +73,11 @@ def choose(
     act([FIRST, best], slice(begin, total))
     tell(total, total, "")
     return trials, best if trials.improves(best) else FIRST
+
+
+def are_slow(policies: Iterable[MPCPolicy]) -> bool:
+    """Whether one of them has a slow solver, as ipopt."""
+    return min(policy.solver.relative_speed for policy in policies) < _SLOW
 
 
 def quick_policy(mpc: MPC) -> MPCPolicy:

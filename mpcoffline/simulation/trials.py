@@ -16,9 +16,9 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc.layout import Layout
 from mpcoffline.solvers import Plan
 
-from .closed_loop import signals_along
 from .logged_cost import LoggedCost
 from .models import LogModels
+from .starts import returns_along, signals_along
 
 _ARRAYS = {
     "votes": "b",
@@ -230,16 +230,3 @@ class Surroundings:
             states.append(x[0].copy())
             actions.append(u.reshape(m, s, -1)[0])
         return Episodes(total, second, lost | over, np.stack(states, axis=1), np.stack(actions, axis=1))
-
-
-def returns_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) -> Array:
-    """What the log cost over the steps that begin in some rows, ``(rows,)``.
-
-    An episode that ends in a terminal state costs nothing afterwards; one that is cut off before ``n_steps`` gives NaN.
-    """
-    lasts = np.append(table.episodes.firsts[1:], len(table)) - 1
-    own = lasts[np.searchsorted(lasts, rows)]
-    ends = np.minimum(own, rows + n_steps - 1)
-    total = np.concatenate([[0.0], np.cumsum(table.values().costs)])
-    whole = (rows + n_steps - 1 <= own) | (np.asarray(table.terminations)[own] > 0.0)
-    return np.where(whole, total[ends + 1] - total[rows], np.nan)
