@@ -13,10 +13,11 @@ from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import Identification, fit_residual, identify, with_residual
+from mpcoffline.estimation import Identification, fit_residual, with_residual
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
+from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.seen import sees_memory
 from mpcoffline.simulation.closed_loop import Simulation, initial_rows, signals_along, simulate
@@ -93,11 +94,12 @@ def diagnose(
     if nominal.layout.delay != learned.layout.delay:  # of the dead time that the learner has found
         nominal = nominal.with_delay(learned.layout.delay)
     table = with_memory(TransitionTable.of(dataset), learned.layout)
-    found = identify(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.replace(model=found.model)
+    known = None if learner.result is None else learner.result.cost
+    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    identified = nominal.replace(model=found.model)
     if learner.result is not None and learner.result.residual_share is not None:
         found, identified = _completed(found, identified, seed)
-    ensemble = Ensemble(identified, clean, found, seed=seed)
+    ensemble = Ensemble(identified, found.table, found, seed=seed)
     seen = None if sees_memory(learned.layout, learned.stage_cost) else learned.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
     slow = min(policy.solver.relative_speed for policy in policies) < _SLOW

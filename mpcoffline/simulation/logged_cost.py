@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.memory import gathered
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
-from mpcoffline.learning.known_cost import excerpt, known_cost
+from mpcoffline.learning.known_cost import COST_ROWS, known_cost
 from mpcoffline.mpc import MPC
 
 _ROWS = 20_000
@@ -47,7 +48,7 @@ class LoggedCost:
         mpc: MPC | None = None,
         logged: TransitionTable | None = None,
     ) -> None:
-        known = None if mpc is None else known_cost(mpc, excerpt(table if logged is None else logged, seed))
+        known = None if mpc is None else known_cost(mpc, excerpt(table if logged is None else logged, COST_ROWS, seed))
         self._known = None if known is None or known.constant or known.agreeing < 1.0 else known
         self._mpc = mpc
         rng = np.random.default_rng(seed)
