@@ -13,11 +13,12 @@ from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import Identification, identify
+from mpcoffline.estimation import Identification
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
+from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
@@ -96,8 +97,9 @@ def diagnose(
     policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
     original, nominal = nominal, nominal.with_delay(learned.layout.delay)  # of the dead time that the learner has found
     table = with_memory(TransitionTable.of(dataset), learned.layout)
-    found = identify(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.replace(model=found.model)
+    known = None if learner.result is None else learner.result.cost
+    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    identified = nominal.replace(model=found.model)
     around = surroundings_of(
         learned,
         original,

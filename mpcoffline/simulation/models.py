@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residuals
 from mpcoffline.estimation.identification import FULL_TURN, OneStepIdentification, OneStepProblem, Rows, without_jumps
 from mpcoffline.estimation.multi_step import Windows
 from mpcoffline.estimation.plant import plant_rows, state_rows
-from mpcoffline.estimation.smoothing import excerpt
 from mpcoffline.estimation.structure import HeldOut
 from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.mpc import MPC
@@ -25,6 +25,7 @@ STEPS = 15  # that are predicted open loop to judge a model
 VOTES = 1.5  # times the error of the best that one with a vote has at most
 NEGLIGIBLE = 0.02  # spreads: of errors below, none is better than another
 
+_EXCERPT = 20_000  # rows that models are learned from and judged on
 _ROWS = 3_000  # that say what an outlier is
 _WINDOWS = 400
 _STARTS = 3  # windows begin so many times a length
@@ -91,7 +92,7 @@ class LogModels:
         Raises:
             InvalidDataError: If the data have other dimensions than the MPC.
         """
-        states, rng = excerpt(state_rows(mpc, table), seed), np.random.default_rng(seed)
+        states, rng = excerpt(state_rows(mpc, table), _EXCERPT, seed), np.random.default_rng(seed)
         rows, held_out = plant_rows(mpc, states), HeldOut.of(states.episode_ids, seed).rows
         used = rows.take(np.flatnonzero(~held_out))
         problem, unwrapped = _problem(mpc, used)
