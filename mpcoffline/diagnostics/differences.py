@@ -190,7 +190,7 @@ def starts_of(trials: Trials, name: str) -> NDArray[np.bool_]:
 
     One that left the choice early was tried on others alone; all count where nothing was chosen.
     """
-    tried = ~np.isnan(trials.of(name)).all(axis=0)
+    tried = np.asarray(~np.isnan(trials.of(name)).all(axis=0))
     fresh = trials.judged & tried
     return fresh if fresh.any() else tried
 
