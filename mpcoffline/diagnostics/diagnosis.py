@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import MPCOfflineError
-from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import Identification, fit_residual, identify, with_residual
+from mpcoffline.estimation import Identification
 from mpcoffline.estimation.plant import settled
+from mpcoffline.learner.candidates import FULL
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
+from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.seen import sees_memory
-from mpcoffline.simulation.closed_loop import Simulation, initial_rows, signals_along, simulate
-from mpcoffline.simulation.ensemble import Ensemble
-from mpcoffline.simulation.logged_cost import LoggedCost
-from mpcoffline.simulation.trials import Trials
+from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
+from mpcoffline.simulation.surroundings import surroundings_of
+from mpcoffline.simulation.trials import Episodes, Surroundings, Trials
 
 from .figure import Traces
 from .measures import (
@@ -47,9 +45,7 @@ from .withholding import DEFAULT_RULES, RULES
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-_STARTS = 20
-_FEW_STARTS = 3
-_SLOW = 10.0  # times as fast as ipopt, below which simulating all starts takes minutes
+_FRESH = 1_000  # added to the seed: other models and starts than those of the choice
 
 
 def diagnose(
@@ -57,16 +53,17 @@ def diagnose(
     dataset: MinariDataset | TransitionTable | str,
     *,
     n_starts: int | None = None,
-    n_steps: int = 100,
+    n_steps: int | None = None,
     seed: int = 0,
     rules: Sequence[str] = DEFAULT_RULES,
 ) -> Report:
     """Diagnoses a fit from the log alone.
 
-    Both controllers, MPC_1 and the learned one, are simulated on an ensemble of models identified from the log (see
-    :class:`~mpcoffline.simulation.ensemble.Ensemble`), from initial states of the log, with a stage cost learned from
-    the logged costs (:class:`~mpcoffline.simulation.logged_cost.LoggedCost`). That decides the verdict
-    (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
+    MPC_1 and the controller that the learner hands out act on models of the log
+    (:class:`~mpcoffline.simulation.models.LogModels`), from the same starts of the log, under what disturbed it then,
+    with the user's own stage cost or one learned from the logged costs
+    (:class:`~mpcoffline.simulation.logged_cost.LoggedCost`); models and starts are others than those of the choice in
+    ``fit``. That decides the verdict (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
 
     Example:
         >>> report = mpcoffline.diagnose(learner, "mpcoffline/pendulum/ddpg-v0")
@@ -76,10 +73,9 @@ def diagnose(
     Args:
         learner: A fitted learner.
         dataset: What it was fitted on, or another log of the same plant.
-        n_starts: Episodes simulated on each model; 20 by default, 3 where a controller needs a slow solver (ipopt,
-            with constraints), which takes minutes even so.
-        n_steps: Their length.
-        seed: Seeds the ensemble and the choice of starts.
+        n_starts: Episodes simulated on each model; by default as in the choice, 64 or fewer.
+        n_steps: Their length; by default that of the longest logged one.
+        seed: Seeds models, starts and noise.
         rules: Names of the rules that may withhold a recommendation, of ``mpcoffline.diagnostics.withholding.RULES``.
 
     Returns:
@@ -90,33 +86,37 @@ def diagnose(
         UnknownIdError: For a rule that there is none of.
         InvalidDataError: If the data have other dimensions than the MPC.
     """
-    check_integers(1, n_steps=n_steps, **({} if n_starts is None else {"n_starts": n_starts}))
+    counts = {"n_starts": n_starts, "n_steps": n_steps}
+    check_integers(1, **{name: count for name, count in counts.items() if count is not None})
     for name in rules:
         check_known("rule", name, RULES)
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
-    policies = MPCPolicy(nominal), MPCPolicy(learned)
-    if nominal.layout.delay != learned.layout.delay:  # of the dead time that the learner has found
-        nominal = nominal.with_delay(learned.layout.delay)
+    chosen = FULL if learner.candidates is None else learner.candidates.chosen
+    policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
+    original, nominal = nominal, nominal.with_delay(learned.layout.delay)  # of the dead time that the learner has found
     table = with_memory(TransitionTable.of(dataset), learned.layout)
-    found = identify(nominal, table, seed=seed)
-    clean, identified = found.table, nominal.replace(model=found.model)
-    if learner.result is not None and learner.result.residual_share is not None:
-        found, identified = _completed(found, identified, seed)
-    ensemble = Ensemble(identified, clean, found, seed=seed)
-    seen = None if sees_memory(learned.layout, learned.stage_cost) else learned.ny
-    cost = LoggedCost(clean, seed, seen, mpc=nominal, logged=table)
-    slow = min(policy.solver.relative_speed for policy in policies) < _SLOW
-    rows = initial_rows(clean, n_starts or (_FEW_STARTS if slow else _STARTS), seed)
-    starts, signals = clean.take(rows).values().observations, signals_along(clean, rows, n_steps, learned.layout)
-    first, second = (simulate(policy, ensemble, cost, clean, starts, n_steps, signals) for policy in policies)
-    lag = lag_check(identified, clean)
-    failed = (policies[0].solver_stats.failed_share, policies[1].solver_stats.failed_share)
-    trials = _trials(first, second, ensemble, cost, table, rows, n_steps)
+    known = None if learner.result is None else learner.result.cost
+    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    identified = nominal.replace(model=found.model)
+    around = surroundings_of(
+        learned,
+        original,
+        table,
+        found,
+        slow=are_slow(policies.values()),
+        n_starts=n_starts,
+        n_steps=n_steps,
+        seed=seed + _FRESH,
+    )
+    trials, loops = _tried(policies, around)
+    first, second = loops[0], loops[-1]
+    lag, cost = lag_check(identified, clean), around.cost
+    failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     judgement = decide(
         trials,
-        "learned",
+        chosen,
         lag=lag,
         noise=found.noise,
         n_rows=len(table),
@@ -133,7 +133,7 @@ def diagnose(
         value=value_check(learner.value_function, clean, learned.discount),
         fit=fit_errors(nominal, learned, learner.value_function, clean, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
-        theorem=_theorem(learned, policies[1], learner.value_function, clean, second),
+        theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second),
         weights=weight_checks(nominal, learned, clean),
         at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
@@ -156,49 +156,10 @@ def diagnose(
     return report.with_notes(notes_on(report, fit))
 
 
-def _trials(
-    first: Simulation,
-    second: Simulation,
-    ensemble: Ensemble,
-    cost: LoggedCost,
-    table: TransitionTable,
-    rows: NDArray[np.intp],
-    n_steps: int,
-) -> Trials:
-    """Both simulations side by side."""
-    costs = np.stack([first.cost, second.cost]) + n_steps * cost.low
-    return Trials(
-        names=("MPC_1", "learned"),
-        models=("identified", *(f"variation {k}" for k in range(1, len(ensemble)))),
-        votes=np.ones(len(ensemble), dtype=bool),
-        cost=costs,
-        second=costs,
-        lost=np.stack([first.lost, second.lost]),
-        rows=rows,
-        returns=_logged_costs(table, rows, n_steps),
-        judged=np.ones(len(rows), dtype=bool),
-        n_steps=n_steps,
-    )
-
-
-def _logged_costs(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) -> Array:
-    """What the log cost from these rows over so many steps, ``(starts,)``; NaN where an episode ends before."""
-    ends = table.episode_ids
-    found = np.full(len(rows), np.nan)
-    for i, row in enumerate(rows):
-        if row + n_steps <= len(table) and ends[row] == ends[row + n_steps - 1]:
-            found[i] = table.take(slice(int(row), int(row) + n_steps)).costs.astype(np.float64).sum()
-    return found
-
-
-def _completed(found: Identification, identified: MPC, seed: int) -> tuple[Identification, MPC]:
-    """The identified model with a learned residual, as in the fit: without, all models here would lack the same."""
-    residual = fit_residual(identified, found.table, seed)
-    if not residual.taken:
-        return found, identified
-    mpc = with_residual(identified, residual)
-    errors = np.full_like(found.errors_after, residual.one_step[1])
-    return replace(found, model=mpc.model, errors_after=errors), mpc
+def _tried(policies: Mapping[str, MPCPolicy], around: Surroundings) -> tuple[Trials, list[Episodes]]:
+    """Closed loops of some controllers from the same starts, of which none had a part in any choice."""
+    trials = Trials.none(list(policies), around, judged=np.ones(len(around.rows), dtype=bool))
+    return trials, [trials.fill(name, around, policy, slice(0, len(around.rows))) for name, policy in policies.items()]
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:
@@ -211,7 +172,7 @@ def _theorem(
     policy: MPCPolicy,
     value: ValueFunction,
     table: TransitionTable,
-    simulation: Simulation,
+    simulation: Episodes,
 ) -> TheoremCheck:
     """The condition of Theorem 1, along rollouts on the identified model."""
     states = simulation.states.reshape(-1, learned.nx)

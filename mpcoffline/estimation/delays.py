@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.memory import rows_before
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
@@ -87,7 +88,7 @@ def find_delays(mpc: MPC, table: TransitionTable, *, seed: int = 0) -> DelaySear
     """
     table.check_fits(mpc.ny, mpc.nu)
     given = best = mpc.layout.delay
-    scan = _Scan(mpc, _excerpt(table, seed), seed)
+    scan = _Scan(mpc, excerpt(table, _ROWS, seed), seed)
     visited = [0] * mpc.nu
     if not scan.tells(given):
         return DelaySearch(given, given, 1.0, tuple(visited))
@@ -251,7 +252,7 @@ class _Scan:
         acting = self._acting(delay)
         every = self._problem.on(Rows(self._x[rows], acting[rows], self._reached[rows]))
         missed = np.nan_to_num(every.errors(model.theta), nan=0.0, posinf=0.0, neginf=0.0)
-        known = np.hstack([np.ones((len(rows), 1)), self._x[rows] / self._spread, acting[rows]])
+        known = np.hstack([np.ones((len(rows), 1)), _standard(np.hstack([self._x[rows], acting[rows]]))])
         past = np.stack([self._u[rows - d, i] for d in range(self._cap + 1)], axis=1)
         past, missed = (v - known @ np.linalg.lstsq(known, v, rcond=None)[0] for v in (past, missed))
         size = np.sqrt(np.outer(np.sum(past**2, axis=0), np.sum(missed**2, axis=0)))
@@ -261,13 +262,7 @@ class _Scan:
         return int(np.flatnonzero(clear).max(initial=0))
 
 
-def _excerpt(table: TransitionTable, seed: int) -> TransitionTable:
-    """Some episodes of a large table; of long ones, their beginnings."""
-    if len(table) <= _ROWS:
-        return table
-    _, firsts, lengths = table.episodes
-    order = np.random.default_rng(seed).permutation(len(firsts))
-    wanted = max(2_000, _ROWS // len(order))
-    sizes = np.minimum(lengths[order], wanted)
-    chosen = np.sort(order[: 1 + int(np.searchsorted(np.cumsum(sizes), _ROWS))])
-    return table.take(np.concatenate([firsts[k] + np.arange(min(lengths[k], wanted)) for k in chosen]))
+def _standard(columns: Array) -> Array:
+    """Columns ``(n, m)`` about their mean, in units of their spread; one that is a number is zero."""
+    about, spread = columns - columns.mean(axis=0), columns.std(axis=0)
+    return np.asarray(np.divide(about, spread, out=np.zeros_like(about), where=spread > 0.0))

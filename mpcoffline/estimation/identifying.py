@@ -10,6 +10,7 @@ import numpy as np
 
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC, Model
@@ -26,9 +27,9 @@ from .kalman import Filtered, filtered, smoothed
 from .multi_step import MultiStepProblem, Windows
 from .plant import plant_rows, state_rows
 from .smoothing import (
+    EXCERPT,
     FEW_ROWS,
     NoiseEstimate,
-    excerpt,
     filter_noise,
     noise_by_moments,
     smoothed_plant,
@@ -146,7 +147,7 @@ def _checked(
     mpc: MPC, rows: TransitionTable, found: Identification, config: IdentificationConfig, seed: int
 ) -> MultiStepCheck | None:
     """The check of structure, on the rows as logged."""
-    source = excerpt(rows, seed)
+    source = excerpt(rows, EXCERPT, seed)
     few = Trajectories.of(mpc, source, found.unwrapped).thinned(FEW_ROWS, seed)
     return check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
 
@@ -164,7 +165,7 @@ def _identified(
         return Identification(**vars(found), table=table, noise=noise, model=model, episode_spread=spread)
 
     first = identify_plant(mpc, table, config, seed=seed)
-    source = excerpt(table, seed)
+    source = excerpt(table, EXCERPT, seed)
     few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)
     silent = noise.source == "unknown" or noise.negligible
@@ -179,7 +180,7 @@ def _identified(
     if horizon is not None and len(z):
         z, misfit = _predicting_far(mpc, few, noisy, (np.zeros_like(z), z), horizon, config, source)
     clean = table if silent else smoothed_plant(mpc, table, noisy.theta(z), noise, first.unwrapped)
-    rows = Trajectories.of(mpc, excerpt(clean, seed), first.unwrapped).rows()
+    rows = Trajectories.of(mpc, excerpt(clean, EXCERPT, seed), first.unwrapped).rows()
     problem = OneStepProblem(mpc, rows, centre, noisy.coordinates)
     return result(described(mpc, problem, z, misfit, config.prior_spread, first.unwrapped), clean, noise)
 
@@ -188,7 +189,7 @@ def _by_episode(
     mpc: MPC, table: TransitionTable, found: OneStepIdentification, config: IdentificationConfig, seed: int
 ) -> tuple[OneStepIdentification, EpisodeSpread | None]:
     """What was identified with the mean of what varies from episode to episode, and its spread."""
-    source = excerpt(table, seed)
+    source = excerpt(table, EXCERPT, seed)
     few = Trajectories.of(mpc, source, found.unwrapped).thinned(FEW_ROWS, seed)
     problem = OneStepProblem(mpc, few.rows(), table.centring.centre[: table.ny])
     if not problem.varying.any():  # fixed by their bounds

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.memory import with_plant_states
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
@@ -30,10 +31,10 @@ NEGLIGIBLE = 0.01
 NEGLIGIBLE_STEP = 0.03
 
 FEW_ROWS = 20_000  # on which the model is identified
+EXCERPT = 2 * FEW_ROWS  # of which these are chosen
 _FEWEST_PAIRS = 30  # of consecutive rows, for an estimate of the noise
 _SIGNIFICANT = 3.0  # standard errors above zero
 _LEAST_PROCESS = 1e-4  # of the increments' spread: keeps covariances regular
-_BLOCK = 1_000  # consecutive rows that are taken together
 _CHUNK = 100_000  # rows that are smoothed at a time
 _FEWER_ROWS = 4_000  # on which the process noise is chosen
 _PROCESS_FACTORS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
@@ -119,7 +120,7 @@ def estimate_noise(mpc: MPC, table: TransitionTable, theta: Array | None = None)
     """
     found = identify_one_step(mpc, table) if theta is None else None
     parameters, unwrapped = (found.theta, found.unwrapped) if found else (np.asarray(theta, np.float64), ())
-    return noise_by_moments(Trajectories.of(mpc, excerpt(plant_rows(mpc, table), 0), unwrapped), parameters)
+    return noise_by_moments(Trajectories.of(mpc, excerpt(plant_rows(mpc, table), EXCERPT, 0), unwrapped), parameters)
 
 
 def smooth(
@@ -243,13 +244,3 @@ def _smoothed_states(problem: Trajectories, theta: Array, noise: NoiseEstimate) 
     states[0, where] = (x[:, :-1] - problem.turns[:, :, 0])[valid]
     states[1, where] = (x[:, 1:] - problem.turns[:, :, 1])[valid]
     return states
-
-
-def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
-    """The table, or of a large one some stretches of consecutive rows."""
-    n_blocks, wanted = -(-len(table) // _BLOCK), 2 * FEW_ROWS // _BLOCK
-    if n_blocks <= wanted:
-        return table
-    chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])
-    rows = (chosen[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
-    return table.take(rows[rows < len(table)])

@@ -15,15 +15,12 @@ from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.choice import FIRST, choose, quick_policy
+from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
 
 FULL = "full"
 TRIALS = "trials/"  # in front of the names of their arrays in a file
-
-_SLOW = 10.0  # times as fast as ipopt, below which all starts on all models would take an hour
-_FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3
 
 logger = logging.getLogger(__name__)
 
@@ -162,9 +159,8 @@ def tried(
     mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    slow = any(quick_policy(mpc).solver.relative_speed < _SLOW for mpc in (nominal, known.mpc))
-    effort = {"n_starts": _FEW_STARTS, "most_steps": _FEW_STEPS, "most_models": _FEW_MODELS} if slow else {}
-    around = surroundings_of(known.mpc, nominal, table, known.found, seed=known.seed, **effort)
+    slow = are_slow(quick_policy(mpc) for mpc in (nominal, known.mpc))
+    around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, seed=known.seed)
     trials, chosen = choose(mpcs, around, variants, tell)
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:

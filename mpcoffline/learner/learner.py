@@ -66,7 +66,8 @@ class OfflineMPCLearner:
 
     Args:
         mpc: MPC_1: the nominal MPC. It is never changed.
-        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3).
+        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3). A dead time
+            that the model does not state (``delay=None``) is taken from the log in either case.
         preset: Name of a learning method with options in ``mpcoffline.learner.PRESETS``: ``"paper"`` is the published
             recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
             longest.

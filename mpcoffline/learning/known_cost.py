@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_known
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation import Identification, identify, smooth
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
@@ -26,9 +29,9 @@ StageCostKind = Literal["fitted", "auto", "given"]
 
 _log = logging.getLogger(__name__)
 
-_ROWS = 20_000
+#: Rows on which costs are compared.
+COST_ROWS = 20_000
 _CHUNK = 100_000  # rows that are looked at a time
-_BLOCK = 1_000  # consecutive rows that are taken together
 ROUNDING = 1e-6  # share of the variance that rounding may leave open
 _NOISY = 0.05  # the same where noise in the states may be what is left
 _WHITE = 0.3  # correlation of neighbouring residuals above which these are no noise: wrong costs have .5 to .95
@@ -60,7 +63,7 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     """What is known of the stage cost, from the rows as they were logged: smoothed ones would blur it."""
     if config.stage_cost == "fitted":
         return known
-    rows = excerpt(known.table, known.seed)
+    rows = excerpt(known.table, COST_ROWS, known.seed)
     if config.stage_cost == "auto":
         agreeing = agreeing_cost(known.mpc, rows)
         if agreeing is None:
@@ -215,6 +218,31 @@ def as_logged(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> Trans
     return table.take(np.flatnonzero(np.concatenate(agreeing)))
 
 
+def identify_as_logged(
+    mpc: MPC, table: TransitionTable, rows: TransitionTable, *, tried: Sequence[str] = (), seed: int = 0
+) -> tuple[Identification, TransitionTable]:
+    """The model identified from the rows that tell what inputs do, and all rows without measurement noise.
+
+    Learner and diagnosis identify by this one rule.
+
+    Args:
+        mpc: Its parameters are theta_0.
+        table: Transitions of its states.
+        rows: Those of :func:`as_logged`.
+        tried: See :func:`mpcoffline.estimation.identify`.
+        seed: Likewise.
+
+    Returns:
+        What was identified, whose own table are the rows without noise; and the whole table without it.
+    """
+    found = identify(mpc, rows, tried=tried, seed=seed)
+    if rows is table:
+        return found, found.table
+    if found.noise.negligible:
+        return found, table
+    return found, smooth(mpc.replace(model=found.model), table, found.theta, found.noise)
+
+
 def _rounded(fit: KnownCost, ours: Array, logged: Array, near: float) -> KnownCost:
     """The relation with a scale of 1 where it is as near to that, and without an offset where that is rounding."""
     scale = 1.0 if abs(fit.scale - 1.0) <= near else fit.scale
@@ -280,13 +308,3 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
         return None
     fitted = canonical(mpc, full(found.x))
     return mpc.with_theta(with_level(mpc, fitted, float(missed(fitted).mean())))
-
-
-def excerpt(table: TransitionTable, seed: int) -> TransitionTable:
-    """The table, or of a large one some stretches of consecutive rows."""
-    n_blocks, wanted = -(-len(table) // _BLOCK), _ROWS // _BLOCK
-    if n_blocks <= wanted:
-        return table
-    chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])
-    rows = (chosen[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
-    return table.take(rows[rows < len(table)])

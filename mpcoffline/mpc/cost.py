@@ -194,7 +194,8 @@ class NormCost(Component):
 
     Args:
         x_ref: Reference, ``(nx,)``.
-        eps: Smoothing, in the units of x. Newton solvers get slow below 1e-2; where gamma^N is small, 0.1 is as good.
+        eps: Smoothing, in the units of x: 0.1 suits states of size 1. Newton solvers get slow below a hundredth of
+            their size; where gamma^N is small, a tenth is as good.
 
     Raises:
         InvalidArgumentError: If ``eps`` is not positive.

@@ -27,6 +27,7 @@ Kind = Literal["free", "psd"]
 Group = Literal["model", "cost", "terminal", "reference"]
 Varies = Literal["episode"]
 
+_ROUNDING = 1e-12  # of a coordinate's size, by which it may lie beyond a bound
 _PREFIX = 20  # characters that an MPC puts in front of a name
 
 
@@ -341,7 +342,7 @@ class ParameterSpace(Sequence[Block]):
         return np.stack([self.pack({name: array[k] for name, array in along.items()}) for k in range(n + 1)])
 
     def checked(self, theta: ArrayLike) -> Array:
-        """Theta as float64 ``(size,)``, refused when of the wrong shape, not finite or out of bounds.
+        """Theta as float64 ``(size,)``, refused when of the wrong shape, not finite or, beyond rounding, out of bounds.
 
         Raises:
             InvalidArgumentError: Names the coordinate, its bounds and its value.
@@ -349,7 +350,8 @@ class ParameterSpace(Sequence[Block]):
         array = np.asarray(theta, dtype=np.float64)
         if array.shape != (self.size,):
             raise InvalidArgumentError("theta", expected=f"shape ({self.size},)", actual=f"shape {array.shape}")
-        slack = 1e-12 * (1.0 + np.abs(array))
+        sizes = np.abs(np.stack([array, self.low, self.high]))
+        slack = _ROUNDING * np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0)
         bad = ~((array >= self.low - slack) & (array <= self.high + slack) & np.isfinite(array))
         if bad.any():
             k = int(np.flatnonzero(bad)[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -15,8 +15,10 @@ from .trials import Surroundings, Trials
 
 FIRST = "MPC_1"
 STARTS = 64
-_ROUNDS = (6, 18, 40)  # starts until the end of each; what is left judges
+_SLOW = 10.0  # times as fast as ipopt
+_ROUNDS = (8, 20, 40)  # starts until the end of each; what is left judges
 _CLEAR = 2.0  # standard errors
+_VARIED = 3  # of the best, variants are tried
 
 
 def choose(
@@ -34,7 +36,7 @@ def choose(
     Args:
         mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
         around: Where they are tried; at most two thirds of its starts are used to choose.
-        variants: Of the best one after the first round these are tried, too.
+        variants: Of the three best after the first round these are tried, too.
         tell: Is told how many starts of how many are done, and what is tried.
 
     Returns:
@@ -55,7 +57,8 @@ def choose(
     for end in ends:
         act(left, slice(begin, end))
         if begin == 0:  # what is better may be better still
-            more = {k: v for name in _still_good(trials, left, end)[:1] for k, v in variants(name, mpcs[name]).items()}
+            good = _still_good(trials, left, end)[:_VARIED]
+            more = {new: mpc for name in good for new, mpc in variants(name, mpcs[name]).items()}
             mpcs.update(more)
             policies.update({name: quick_policy(mpc) for name, mpc in more.items()})
             trials, left = trials.with_names(list(more)), [*left, *more]
@@ -70,6 +73,11 @@ def choose(
     act([FIRST, best], slice(begin, total))
     tell(total, total, "")
     return trials, best if trials.improves(best) else FIRST
+
+
+def are_slow(policies: Iterable[MPCPolicy]) -> bool:
+    """Whether one of them has a slow solver, as ipopt."""
+    return min(policy.solver.relative_speed for policy in policies) < _SLOW
 
 
 def quick_policy(mpc: MPC) -> MPCPolicy:

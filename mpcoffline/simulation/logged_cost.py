@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.known_cost import ROUNDING, agreeing_cost, excerpt
+from mpcoffline.learning.known_cost import COST_ROWS, ROUNDING, agreeing_cost
 from mpcoffline.learning.stages import KnownCost
 from mpcoffline.mpc import MPC
 
@@ -55,7 +56,7 @@ class LoggedCost:
     ) -> None:
         table = table if logged is None else logged
         self._seen = table.ny if seen is None else seen
-        agreeing = None if mpc is None else _agreeing(mpc, excerpt(table, seed))
+        agreeing = None if mpc is None else _agreeing(mpc, excerpt(table, COST_ROWS, seed))
         self._mpc: MPC | None = None if agreeing is None else agreeing[0]
         self.known: KnownCost | None = None if agreeing is None else agreeing[1]
         over = np.asarray(table.terminations) > 0.0

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residuals
 from mpcoffline.estimation.identification import FULL_TURN, OneStepIdentification, OneStepProblem, Rows, without_jumps
 from mpcoffline.estimation.multi_step import Windows
-from mpcoffline.estimation.plant import plant_rows
-from mpcoffline.estimation.smoothing import excerpt
+from mpcoffline.estimation.plant import plant_rows, state_rows
 from mpcoffline.estimation.structure import HeldOut
 from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.mpc import MPC
@@ -25,6 +25,7 @@ STEPS = 15  # that are predicted open loop to judge a model
 VOTES = 1.5  # times the error of the best that one with a vote has at most
 NEGLIGIBLE = 0.02  # spreads: of errors below, none is better than another
 
+_EXCERPT = 20_000  # rows that models are learned from and judged on
 _ROWS = 3_000  # that say what an outlier is
 _WINDOWS = 400
 _STARTS = 3  # windows begin so many times a length
@@ -91,23 +92,24 @@ class LogModels:
         Raises:
             InvalidDataError: If the data have other dimensions than the MPC.
         """
-        rows, rng = excerpt(plant_rows(mpc, table), seed), np.random.default_rng(seed)
-        held_out = HeldOut.of(rows.episode_ids, seed).rows
+        states, rng = excerpt(state_rows(mpc, table), _EXCERPT, seed), np.random.default_rng(seed)
+        rows, held_out = plant_rows(mpc, states), HeldOut.of(states.episode_ids, seed).rows
         used = rows.take(np.flatnonzero(~held_out))
         problem, unwrapped = _problem(mpc, used)
         thetas = [mpc.theta, *moved_parameters(problem, used, n_perturbed, rng)]
-        residuals = [each for each in fit_residuals(mpc, used, seed, count=n_residual) if each.network is not None]
+        residuals = fit_residuals(mpc, states.take(np.flatnonzero(~held_out)), seed, count=n_residual)
+        networks = [each for each in residuals if each.network is not None]
         names = ["identified" if found is not None else "given", *(f"moved {i}" for i in range(1, len(thetas)))]
-        names += [f"residual {i}" for i in range(1, len(residuals) + 1)]
-        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(residuals)]), residuals)
+        names += [f"residual {i}" for i in range(1, len(networks) + 1)]
+        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(networks)]), networks)
         errors, baseline = _judged(mpc, members, rows, held_out, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
         if known is not None and not known.negligible:
             noise = np.asarray(known.measurement, dtype=np.float64)
         angles = np.array(unwrapped, dtype=np.intp)
-        states = rows.observations[:, angles].astype(np.float64)
-        middle = (states.min(axis=0) + states.max(axis=0)) / 2.0
+        turning = rows.observations[:, angles].astype(np.float64)
+        middle = (turning.min(axis=0) + turning.max(axis=0)) / 2.0
         return cls(
             tuple(names), errors, baseline, noise, members, mpc.layout, (angles, np.asarray(middle) - FULL_TURN / 2.0)
         )

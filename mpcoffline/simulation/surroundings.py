@@ -11,13 +11,14 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.seen import sees_memory
 
 from .choice import STARTS
-from .closed_loop import initial_rows
 from .logged_cost import LoggedCost
 from .models import LogModels
+from .starts import initial_rows
 from .trials import Surroundings
 
 _MOST_STEPS = 400
-_ENOUGH = 16  # episodes, from which on all start where one of the log did
+_FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
+_HORIZONS = 2  # that an episode has at least: a log of shorter ones tells little of where a loop ends
 
 
 def surroundings_of(
@@ -26,10 +27,9 @@ def surroundings_of(
     table: TransitionTable,
     found: Identification,
     *,
-    n_starts: int = STARTS,
+    slow: bool = False,
+    n_starts: int | None = None,
     n_steps: int | None = None,
-    most_steps: int = _MOST_STEPS,
-    most_models: int | None = None,
     seed: int = 0,
 ) -> Surroundings:
     """Builds all that controllers are tried in.
@@ -39,10 +39,10 @@ def surroundings_of(
         nominal: MPC_1; its stage cost may be the logged one.
         table: The transitions as they were logged.
         found: What was identified.
-        n_starts: Number of episodes on each model.
-        n_steps: Their length; that of the longest logged one by default.
-        most_steps: What that is at most.
-        most_models: Take no more than the best of so many, beside the identified one.
+        slow: Whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best models only.
+        n_starts: Number of episodes on each model; 64 by default, half of them where an episode of the log began, if
+            it has as many.
+        n_steps: Their length; by default that of the longest logged one, but two horizons at least and 400 at most.
         seed: Of models, starts and noise.
 
     Raises:
@@ -55,12 +55,14 @@ def surroundings_of(
         clean = found.table
     elif not found.noise.negligible:
         clean = smooth(identified, logged, found.theta, found.noise)
-    models = LogModels.of(identified, clean, found, seed=seed).asked(most_models)
+    models = LogModels.of(identified, clean, found, seed=seed).asked(_FEW_MODELS if slow else None)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
-    if _ENOUGH <= clean.n_episodes < n_starts:  # others than these begin nearer to where a controller rests
-        n_starts = clean.n_episodes
+    most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
+    if n_starts is None:  # half of them where an episode began: later the log is nearer to where a controller rests
+        n_starts = min(most_starts, max(STARTS // 2, 2 * clean.n_episodes))
     rows = initial_rows(clean, n_starts, seed)
     rows = np.random.default_rng([seed, 1]).permutation(rows)  # those that judge are like those that choose
-    n_steps = n_steps or min(most_steps, int(table.episodes.lengths.max()))
+    if n_steps is None:
+        n_steps = min(most_steps, max(int(table.episodes.lengths.max()), _HORIZONS * mpc.horizon))
     return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)

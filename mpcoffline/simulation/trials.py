@@ -16,9 +16,9 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc.layout import Layout
 from mpcoffline.solvers import Plan
 
-from .closed_loop import signals_along
 from .logged_cost import LoggedCost
 from .models import LogModels
+from .starts import returns_along, signals_along
 
 _ARRAYS = {
     "votes": "b",
@@ -27,6 +27,7 @@ _ARRAYS = {
     "lost": "b",
     "rows": "i",
     "returns": "f",
+    "begun": "b",
     "judged": "b",
     "n_steps": "i",
 }
@@ -54,6 +55,7 @@ class Trials:
         lost: Whether the state ran away, or the episode ended as bad ones do.
         rows: The row of the log that each start is, ``(starts,)``.
         returns: What the log itself cost from there over as many steps, ``(starts,)``; NaN where it ends before.
+        begun: The starts at which an episode of the log began, ``(starts,)``: they tell what an episode costs.
         judged: The starts that had no part in the choice among the controllers, ``(starts,)``.
         n_steps: Length of an episode.
     """
@@ -66,6 +68,7 @@ class Trials:
     lost: NDArray[np.bool_]
     rows: NDArray[np.intp]
     returns: Array
+    begun: NDArray[np.bool_]
     judged: NDArray[np.bool_]
     n_steps: int
 
@@ -75,7 +78,7 @@ class Trials:
         shape = len(names), len(around.models), len(around.rows)
         cost, second, lost = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
         models, rows, returns = around.models, around.rows, around.returns
-        parts = cost, second, lost, rows, returns, judged, around.n_steps
+        parts = cost, second, lost, rows, returns, around.begun, judged, around.n_steps
         return cls(tuple(names), models.names, models.votes, *parts)
 
     def fill(self, name: str, around: Surroundings, controller: Controller, starts: slice) -> Episodes:
@@ -120,7 +123,7 @@ class Trials:
         """
         n = np.size(arrays.get("rows", ()))
         shapes: dict[str, tuple[int, ...]] = {name: (len(names), len(models), n) for name in ("cost", "second", "lost")}
-        shapes |= {"votes": (len(models),), "n_steps": ()} | dict.fromkeys(("rows", "returns", "judged"), (n,))
+        shapes |= {"votes": (len(models),), "n_steps": ()} | dict.fromkeys(("rows", "returns", "begun", "judged"), (n,))
         for name, kind in _ARRAYS.items():
             array = arrays.get(name)
             if array is None or array.shape != shapes[name] or array.dtype.kind != kind:
@@ -180,6 +183,7 @@ class Surroundings:
         rng = np.random.default_rng([seed, _NOISE])
         self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
         self.returns = returns_along(table, rows, n_steps)
+        self.begun = np.isin(rows, table.episodes.firsts)
         states = columns.observations
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
@@ -226,16 +230,3 @@ class Surroundings:
             states.append(x[0].copy())
             actions.append(u.reshape(m, s, -1)[0])
         return Episodes(total, second, lost | over, np.stack(states, axis=1), np.stack(actions, axis=1))
-
-
-def returns_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) -> Array:
-    """What the log cost over the steps that begin in some rows, ``(rows,)``.
-
-    An episode that ends in a terminal state costs nothing afterwards; one that is cut off before ``n_steps`` gives NaN.
-    """
-    lasts = np.append(table.episodes.firsts[1:], len(table)) - 1
-    own = lasts[np.searchsorted(lasts, rows)]
-    ends = np.minimum(own, rows + n_steps - 1)
-    total = np.concatenate([[0.0], np.cumsum(table.values().costs)])
-    whole = (rows + n_steps - 1 <= own) | (np.asarray(table.terminations)[own] > 0.0)
-    return np.where(whole, total[ends + 1] - total[rows], np.nan)

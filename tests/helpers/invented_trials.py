@@ -60,6 +60,7 @@ def trials(
         lost=np.zeros(cost.shape, dtype=bool),
         rows=100 * np.arange(n_starts),
         returns=returns,
+        begun=np.ones(n_starts, dtype=bool),
         judged=np.ones(n_starts, dtype=bool),
         n_steps=50,
     )

@@ -53,7 +53,7 @@ def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def quick(mpc: MPC | None = None, **options: Any) -> OfflineMPCLearner:
     how = {} if "preset" in options else {"method": "bellman"}  # whose options are the published ones
-    return OfflineMPCLearner(mpc or make_mpc(), **(QUICK | how | options))
+    return OfflineMPCLearner(mpc or make_mpc(), **({"candidate": "full"} | QUICK | how | options))
 
 
 def fitted(table: TransitionTable | None = None, **options: Any) -> OfflineMPCLearner:

@@ -27,6 +27,7 @@ QUICK: dict[str, Any] = {
     "adapt_above": 0.0,
     "terminal": "quadratic",
     "stage_cost": "fitted",  # else it is known here
+    "candidate": "full",
 }
 EPOCHS = 6  # three of (VALUE), two of (FIT), and the last one
 

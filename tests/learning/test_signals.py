@@ -14,7 +14,7 @@ from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.estimation import find_delays, identify
 from mpcoffline.learning import Bellman, ParameterConfig, StartConfig, TerminalConfig, ValueConfig
 from mpcoffline.learning.bellman.equation import BellmanProblem
-from mpcoffline.simulation.closed_loop import signals_along
+from mpcoffline.simulation.starts import signals_along
 
 
 def step(x: ca.SX, u: ca.SX, p: dict[str, ca.SX], d: Any) -> ca.SX:

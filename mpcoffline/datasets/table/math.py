@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CHUNK = 1 << 16
+_SIGN = np.uint32(1 << 31)
 
 Floats = NDArray[np.float64]
 
@@ -129,7 +130,7 @@ def innermost(
     states: Callable[[NDArray[np.float32]], tuple[Any, Any]] | None = None,
     count: int | None = None,
 ) -> NDArray[np.intp]:
-    """The ``fraction`` of rows with the smallest max(|s / med|, |s+ / med|), med as :func:`magnitudes` gives it.
+    """The ``fraction`` of rows with the smallest max(|s - m| / h, |s+ - m| / h), m and h of :func:`middles`.
 
     Args:
         rows: The packed rows ``(n, 2 ny + nu + 2)``; where they are centred, it is the distance from the centre.
@@ -142,15 +143,15 @@ def innermost(
     Returns:
         Their numbers, ascending.
     """
-    scale = magnitudes(rows, ny if count is None else count)
+    middle, half = middles(rows, ny if count is None else count)
     score = np.empty(len(rows))
     for i in range(0, len(rows), CHUNK):
         block = rows[i : i + CHUNK]
         both = split(block, ny, nu)[::3] if states is None else states(block)
         s, s_next = (part[:, :count] for part in both)
         # float64: ratios of float32 numbers can overflow.
-        reached = np.maximum(np.abs(s.T), np.abs(s_next.T)).astype(np.float64, order="C")
-        score[i : i + CHUNK] = (reached / scale[:, None]).max(axis=0)
+        far = (np.abs(part.T.astype(np.float64, order="C") - middle[:, None]) for part in (s, s_next))
+        score[i : i + CHUNK] = (np.maximum(*far) / half[:, None]).max(axis=0)
     kept = max(1, round(fraction * len(rows)))
     farthest = np.partition(score, kept - 1)[kept - 1]
     inside = score < farthest
@@ -158,28 +159,34 @@ def innermost(
     return np.flatnonzero(inside)
 
 
-def magnitudes(rows: NDArray[np.float32], ny: int) -> Floats:
-    """The exact median of |s| of each observation ``(ny,)``; where that is 0 its mean, where that is 0 too, 1."""
+def middles(rows: NDArray[np.float32], ny: int) -> tuple[Floats, Floats]:
+    """The middle between the quartiles of each observation, and half their distance, ``(ny,)`` both.
+
+    The quartiles are values of the rows. Where they are one number, the mean distance from it stands for the half
+    distance; where that is zero too, 1.
+    """
     n = len(rows)
-    ranks = sorted({(n - 1) // 2, n // 2})
-    middle = _ranked_in_file if isinstance(rows, np.memmap) else _ranked
-    scale = middle(rows, ny, ranks).mean(axis=0, dtype=np.float64)
-    if not scale.all():
-        total = sum(np.abs(rows[i : i + CHUNK, :ny]).sum(axis=0, dtype=np.float64) for i in range(0, n, CHUNK))
-        scale = np.where(scale > 0.0, scale, total / n)
-    return np.where(scale > 0.0, scale, 1.0)
+    first = (n - 1) // 4
+    ranked = _ranked_in_file if isinstance(rows, np.memmap) else _ranked
+    low, high = ranked(rows, ny, [first, n - 1 - first]).astype(np.float64)
+    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    if not half.all():
+        blocks = (rows[i : i + CHUNK, :ny].astype(np.float64) - middle for i in range(0, n, CHUNK))
+        half = np.where(half > 0.0, half, sum(np.abs(block).sum(axis=0) for block in blocks) / n)
+    return middle, np.where(half > 0.0, half, 1.0)
 
 
 def _ranked(rows: NDArray[np.float32], ny: int, ranks: list[int]) -> NDArray[np.float32]:
-    """The entries of those ranks among the |s| of each observation, ``(ranks, ny)``."""
-    return np.stack([np.partition(np.abs(rows[:, i]), ranks)[ranks] for i in range(ny)], axis=1)
+    """The entries of those ranks among each observation, ``(ranks, ny)``."""
+    return np.stack([np.partition(rows[:, i], ranks)[ranks] for i in range(ny)], axis=1)
 
 
 def _ranked_in_file(rows: NDArray[np.float32], ny: int, ranks: list[int]) -> NDArray[np.float32]:
     """The same of a memory map, in two passes and little memory, whatever n is.
 
-    A non-negative float32 has the order of its bits read as an integer. So one pass counts the upper halves of these,
-    and a second one the lower halves where the upper one is that of the rank.
+    A float32 has the order of its bits read as an integer, once those of a negative one are inverted and the sign of
+    others is set. So one pass counts the upper halves of these, and a second one the lower halves where the upper one
+    is that of the rank.
     """
     upper = np.zeros((ny, 1 << 16), dtype=np.int64)
     for high, _ in _halves(rows, ny):
@@ -197,11 +204,12 @@ def _ranked_in_file(rows: NDArray[np.float32], ny: int, ranks: list[int]) -> NDA
         for i in range(ny):
             before = ends[i, bins[k, i]] - upper[i, bins[k, i]]
             found[k, i] = (bins[k, i] << 16) + np.searchsorted(np.cumsum(lower[k, i]), rank - before, side="right")
-    return found.view(np.float32)
+    return np.where(found & _SIGN, found ^ _SIGN, ~found).view(np.float32)
 
 
 def _halves(rows: NDArray[np.float32], ny: int) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """Upper and lower halves of the bits of |s|, block by block."""
+    """Upper and lower halves of the ordered bits of s, block by block."""
     for i in range(0, len(rows), CHUNK):
-        bits = np.abs(rows[i : i + CHUNK, :ny]).view(np.uint32)
+        bits = np.ascontiguousarray(rows[i : i + CHUNK, :ny]).view(np.uint32)
+        bits = np.where(bits & _SIGN, ~bits, bits | _SIGN)
         yield bits >> 16, bits & 0xFFFF

@@ -315,8 +315,8 @@ class TransitionTable:
     def trim(self, fraction: float, count: int | None = None) -> TransitionTable:
         """Drops the transitions farthest out, on which a value regression would spend itself.
 
-        Keeps the rows with the smallest ``max(|s / med|, |s+ / med|)`` over the coordinates, with med the median of
-        ``|s|`` of each (where that is zero its mean, where that is zero too, 1).
+        Keeps the rows with the smallest ``max(|s - m|, |s+ - m|) / h`` over the coordinates, with m the middle between
+        the quartiles of each and h half their distance (where that is zero the mean of ``|s - m|``, else 1).
 
         Args:
             fraction: Share of rows to keep, in (0, 1].

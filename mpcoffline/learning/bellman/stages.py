@@ -12,11 +12,11 @@ import torch
 from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import fit_residual, identify, smooth, with_residual
+from mpcoffline.estimation import fit_residual, with_residual
 from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.ends import ends_matter, priced_ends
-from mpcoffline.learning.known_cost import as_logged
+from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.potential import Potential
 from mpcoffline.learning.stages import Known, Stage, Training
@@ -34,6 +34,7 @@ _log = logging.getLogger(__name__)
 
 _SCALE_ROWS = 5_000
 _TERMINAL_ROWS = 100_000
+_NORM_ROUNDING = 0.05  # of the states' spread
 
 
 @dataclass(frozen=True)
@@ -83,21 +84,17 @@ def identified(known: Known, config: StartConfig) -> Known:
         return known
     tried = ["dead times"] if config.delays and known.value_function is None else []
     rows = as_logged(known.mpc, known.table, known.cost)
-    found = identify(known.mpc, rows, tried=tried, seed=known.seed)
-    table = found.table
-    if rows is not known.table:
-        silent, identified = found.noise.negligible, known.mpc.replace(model=found.model)
-        table = known.table if silent else smooth(identified, known.table, found.theta, found.noise)
+    found, table = identify_as_logged(known.mpc, known.table, rows, tried=tried, seed=known.seed)
     known = replace(known, table=table, found=found)
     if "model" not in known.groups:
         return known
     known = replace(known, mpc=known.mpc.replace(model=found.model), model_error=found.error_after)
-    return completed(known) if config.residual and found.error_after > config.adapt_above else known
+    return completed(known, found.table) if config.residual and found.error_after > config.adapt_above else known
 
 
-def completed(known: Known) -> Known:
-    """The identified model with a learned residual, where held-out episodes ask for one."""
-    residual = fit_residual(known.mpc, as_logged(known.mpc, known.table, known.cost), known.seed)
+def completed(known: Known, rows: TransitionTable) -> Known:
+    """The identified model with a learned residual on the rows it is of, where held-out episodes ask for one."""
+    residual = fit_residual(known.mpc, rows, known.seed)
     _log.info("%s", residual)
     if not residual.taken:
         return known
@@ -207,7 +204,7 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
     goal = settled(known.mpc, known.table)
     unpriced = config.method == "auto" and not ends_matter(known.table, known.mpc.discount)  # ends are no part of f
     exact = riccati_cost(known.mpc) if unpriced else None
-    cost: TerminalCost = NormCost(goal) if exact is None else exact
+    cost: TerminalCost = NormCost(goal, _norm_rounding(known.table)) if exact is None else exact
     if exact is not None:
         _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")
     elif config.method != "norm":
@@ -224,6 +221,12 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
         )
     mpc = known.mpc.replace(terminal_cost=cost)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
+
+
+def _norm_rounding(table: TransitionTable) -> float:
+    """Where the norm's kink is rounded, in the unit of the states: a share of how far they spread."""
+    spread = table.sample(_SCALE_ROWS, 0).values().observations.std(axis=0)
+    return _NORM_ROUNDING * (float(np.linalg.norm(spread)) or 1.0)
 
 
 def _as_far_as(given: MPC, mpc: MPC) -> MPC:

@@ -21,7 +21,7 @@ from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.store.writing import write_dataset
 from mpcoffline.datasets.table import build as table_build, cache as table_cache
 from mpcoffline.datasets.table.hdf5_episodes import COLUMNS, read_episodes
-from mpcoffline.datasets.table.math import innermost, magnitudes
+from mpcoffline.datasets.table.math import innermost, middles
 
 NY, NU = 3, 2
 
@@ -306,14 +306,16 @@ def test_concatenation_refuses_other_plants() -> None:
     values=st.lists(st.floats(-(2.0**127), 2.0**127, width=32), min_size=1, max_size=40),
     fraction=st.floats(0.01, 1.0),
 )
-def test_medians_are_exact_and_trimming_is_by_definition(values: list[float], fraction: float) -> None:
+def test_quartiles_are_exact_and_trimming_is_by_definition(values: list[float], fraction: float) -> None:
     rows = np.array([[v, 0.5, 1.0, v / 2, 0.0] for v in values], np.float32)
-    size = np.abs(rows[:, 0].astype(np.float64))
-    scale = np.median(size) or size.mean() or 1.0
-    np.testing.assert_allclose(magnitudes(rows, 1), [scale], rtol=1e-15)
-    np.testing.assert_array_equal(magnitudes(rows.view(np.memmap), 1), magnitudes(rows, 1))
+    column = np.sort(rows[:, 0].astype(np.float64))
+    low, high = column[(len(column) - 1) // 4], column[len(column) - 1 - (len(column) - 1) // 4]
+    middle = (low + high) / 2
+    scale = (high - low) / 2 or np.abs(column - middle).mean() or 1.0
+    np.testing.assert_allclose(middles(rows, 1), [[middle], [scale]], rtol=1e-15)
+    np.testing.assert_array_equal(middles(rows.view(np.memmap), 1), middles(rows, 1))
     kept = innermost(rows, 1, 1, fraction)
-    score = np.maximum(size, np.abs(rows[:, 3].astype(np.float64)))
+    score = np.abs(rows[:, [0, 3]].astype(np.float64) - middle).max(axis=1) / scale
     assert len(kept) == max(1, round(fraction * len(values)))
     assert list(kept) == sorted(sorted(range(len(score)), key=score.__getitem__)[: len(kept)])  # ties by order
 

@@ -71,12 +71,15 @@ def test_trimming_keeps_the_rows_nearest_to_the_middle(data: Arrays, fraction: f
     trimmed = table.trim(fraction)
     assert len(trimmed) == max(1, round(fraction * len(table)))
     # Independent: score every row with plain loops.
-    scale = []
+    middle, scale = [], []
     for i in range(table.ny):
-        column = np.abs(table.observations[:, i])
-        scale.append(float(np.median(column)) or float(np.mean(column)) or 1.0)
+        column = sorted(float(v) for v in table.observations[:, i])
+        first = (len(column) - 1) // 4
+        low, high = column[first], column[-1 - first]
+        middle.append((low + high) / 2)
+        scale.append((high - low) / 2 or float(np.mean([abs(v - middle[i]) for v in column])) or 1.0)
     scores = [
-        max(max(abs(s[i]) / scale[i], abs(t[i]) / scale[i]) for i in range(table.ny))
+        max(max(abs(s[i] - middle[i]), abs(t[i] - middle[i])) / scale[i] for i in range(table.ny))
         for s, t in zip(table.observations.astype(float), table.next_observations.astype(float), strict=True)
     ]
     kept = [row.tobytes() for row in trimmed.rows]

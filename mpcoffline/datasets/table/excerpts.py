@@ -1,0 +1,25 @@
+"""An excerpt of a large table for what looks at rows one after another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .transitions import TransitionTable
+
+_BLOCK = 1_000  # consecutive rows that are taken together
+
+
+def excerpt(table: TransitionTable, rows: int, seed: int) -> TransitionTable:
+    """The table, or of a larger one some stretches of consecutive rows, in their order.
+
+    Args:
+        table: The transitions.
+        rows: How many of them, to a thousand.
+        seed: Seeds the choice.
+    """
+    n_blocks, wanted = -(-len(table) // _BLOCK), max(1, rows // _BLOCK)
+    if n_blocks <= wanted:
+        return table
+    chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])
+    taken = (chosen[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
+    return table.take(taken[taken < len(table)])
