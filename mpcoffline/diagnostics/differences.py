@@ -42,9 +42,9 @@ class Difference:
 
     @classmethod
     def of(cls, trials: Trials, name: str, other: str) -> Difference:
-        """From trials, on the starts that had no part in the choice among the controllers."""
+        """From trials, on the starts by which the controller is judged."""
         i, k = trials.names.index(name), trials.names.index(other)
-        starts, votes = judged(trials), trials.votes
+        starts, votes = starts_of(trials, name), trials.votes
         both = [
             paired(costs[i][votes][:, starts], costs[k][votes][:, starts]) for costs in (trials.cost, trials.second)
         ]
@@ -173,11 +173,11 @@ class Candidate:
 
 def candidates(trials: Trials) -> tuple[Candidate, ...]:
     """All controllers that were tried but MPC_1, the cheapest first; none where no model has a vote."""
-    found, starts = [], judged(trials)
+    found = []
     for i, name in enumerate(trials.names[1:], 1):
         d = Difference.of(trials, name, trials.names[0])
         if len(d):
-            k = d.middle
+            k, starts = d.middle, starts_of(trials, name)
             cost, _ = paired(trials.cost[i][trials.votes][:, starts], np.zeros((len(d), int(starts.sum()))))
             lost = float(trials.lost[i][trials.votes][:, starts].mean())
             levels = float(cost[k]), float(d.mean[k]), float(d.error[k])
@@ -185,9 +185,14 @@ def candidates(trials: Trials) -> tuple[Candidate, ...]:
     return tuple(sorted(found, key=lambda each: np.nan_to_num(each.difference, nan=np.inf)))
 
 
-def judged(trials: Trials) -> NDArray[np.bool_]:
-    """The starts on which a choice is judged; all where nothing was chosen."""
-    return trials.judged if trials.judged.any() else np.ones(len(trials.rows), dtype=bool)
+def starts_of(trials: Trials, name: str) -> NDArray[np.bool_]:
+    """The starts by which a controller is judged: those that had no part in the choice, where it was tried there.
+
+    One that left the choice early was tried on others alone; all count where nothing was chosen.
+    """
+    tried = np.asarray(~np.isnan(trials.of(name)).all(axis=0))
+    fresh = trials.judged & tried
+    return fresh if fresh.any() else tried
 
 
 def outvoted(n: int) -> int:

@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
 
-from .differences import SURE, TODAY, Difference, Today, judged, outvoted, paired
+from .differences import SURE, TODAY, Difference, Today, outvoted, paired, starts_of
 from .measures import LagCheck
 from .withholding import DEFAULT_RULES, RULES, Evidence, gone_wrong
 
@@ -106,19 +106,24 @@ def _gains(first: Difference, trials: Trials) -> bool:
     """Whether the median model says that the controller is cheaper, beyond two standard errors and a trifle."""
     k = first.middle
     gain = -first.mean[k] - SURE * first.error[k]
-    return bool(gain > 0.0 and -first.mean[k] > _LEAST * _spread(trials, trials.names[0], k))
+    return bool(gain > 0.0 and -first.mean[k] > _LEAST * _spread(trials, first, k))
 
 
-def _spread(trials: Trials, name: str, k: int) -> float:
-    """Standard deviation over the starts of a controller's cost on voting model k."""
-    costs = trials.of(name)[trials.votes][k][judged(trials)]
+def _spread(trials: Trials, first: Difference, k: int) -> float:
+    """Standard deviation over the starts of MPC_1's cost on voting model k."""
+    costs = _costs(trials, trials.names[0], first, k)
     return float(np.nanstd(costs)) if np.isfinite(costs).any() else 0.0
 
 
-def _level(trials: Trials, name: str, k: int) -> float:
+def _level(trials: Trials, name: str, first: Difference, k: int) -> float:
     """Mean cost on voting model k."""
-    costs = trials.of(name)[trials.votes][k][judged(trials)]
+    costs = _costs(trials, name, first, k)
     return float(np.nanmean(costs)) if not np.isnan(costs).all() else np.nan
+
+
+def _costs(trials: Trials, name: str, first: Difference, k: int) -> Array:
+    """Costs of a controller on voting model k from the starts of a difference."""
+    return np.asarray(trials.of(name)[trials.votes][k][starts_of(trials, first.name)])
 
 
 def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
@@ -151,20 +156,21 @@ def _pair(mean: float, error: float) -> str:
 def _gain(first: Difference, trials: Trials) -> str:
     """By how much the median model says that it is better; a size only where the models agree about it."""
     k, n = first.middle, len(first)
-    levels = " -> ".join(_number(_level(trials, name, k)) for name in (trials.names[0], first.name))
+    levels = " -> ".join(_number(_level(trials, name, first, k)) for name in (trials.names[0], first.name))
     kept = np.sort(first.mean)[: n - outvoted(n)]  # but for the one that is dearest
     alike = kept[-1] < 0.0 and kept[0] / kept[-1] < _ALIKE
     size = "" if alike else f" The models do not agree about the size ({kept[0]:.3g} to {kept[-1]:.3g})."
+    starts = int(starts_of(trials, first.name).sum())
     return (
         f"{first.name} costs {_pair(-first.mean[k], first.error[k])} less than {trials.names[0]} an episode of"
-        f" {trials.n_steps} steps ({levels}, median model, {int(judged(trials).sum())} starts), beyond two standard"
+        f" {trials.n_steps} steps ({levels}, median model, {starts} starts), beyond two standard"
         f" errors on {int(first.better.sum())} of {n} models that predict the log.{size}"
     )
 
 
 def _no_gain(first: Difference, trials: Trials) -> str:
     k = first.middle
-    mean, error, n = first.mean[k], first.error[k], int(judged(trials).sum())
+    mean, error, n = first.mean[k], first.error[k], int(starts_of(trials, first.name).sum())
     if np.isnan(mean):
         return f"{first.name} could not be simulated from any start: nothing is known of it."
     if mean - SURE * error > 0.0:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
 
-from .differences import Difference, judged, outvoted
+from .differences import Difference, outvoted, starts_of
 from .measures import LagCheck
 
 _MUCH_NOISE = 0.12  # of the states' spread
@@ -61,11 +61,11 @@ def _no_model_predicts(e: Evidence) -> str | None:
 def _runaway(e: Evidence) -> str | None:
     if not e.trials.votes.any() or e.proposal == e.trials.names[0]:
         return None
-    own, others = (_lost(e.trials, name).sum(axis=1) for name in (e.proposal, e.trials.names[0]))
+    own, others = (_lost(e, name).sum(axis=1) for name in (e.proposal, e.trials.names[0]))
     more = own > others
     if int(more.sum()) <= outvoted(len(more)):
         return None
-    n, k = int(judged(e.trials).sum()), int(np.argmax(own))
+    n, k = int(starts_of(e.trials, e.proposal).sum()), int(np.argmax(own))
     return (
         f"It is lost more often than {e.trials.names[0]} on {int(more.sum())} of {len(more)} models, from {int(own[k])}"
         f" of {n} starts on one of them: restrict the inputs, give limits, or record data where it goes."
@@ -128,12 +128,12 @@ def gone_wrong(e: Evidence) -> tuple[str, ...]:
 
     One is lost where MPC_1 is not, or costs more than MPC_1 from there by more than the starts differ.
     """
-    trials, starts = e.trials, judged(e.trials)
+    trials, starts = e.trials, starts_of(e.trials, e.proposal)
     if not trials.votes.any() or e.proposal == trials.names[0]:
         return ()
     k = Difference.of(trials, e.proposal, trials.names[0]).middle
     own, first = (trials.of(name)[trials.votes][k][starts] for name in (e.proposal, trials.names[0]))
-    lost = (_lost(trials, e.proposal) & ~_lost(trials, trials.names[0]))[k]
+    lost = (_lost(e, e.proposal) & ~_lost(e, trials.names[0]))[k]
     with np.errstate(invalid="ignore"):
         dear = (
             (own - first > np.nanstd(first)) & ~lost if np.isfinite(first).any() else np.zeros(len(first), dtype=bool)
@@ -149,6 +149,7 @@ def gone_wrong(e: Evidence) -> tuple[str, ...]:
     )
 
 
-def _lost(trials: Trials, name: str) -> NDArray[np.bool_]:
-    """Which episodes were lost, ``(voting models, judged starts)``."""
-    return np.asarray(trials.lost[trials.names.index(name)][trials.votes][:, judged(trials)])
+def _lost(e: Evidence, name: str) -> NDArray[np.bool_]:
+    """Which of a controller's episodes were lost, ``(voting models, starts that judge)``."""
+    trials = e.trials
+    return np.asarray(trials.lost[trials.names.index(name)][trials.votes][:, starts_of(trials, e.proposal)])

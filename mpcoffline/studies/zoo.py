@@ -6,24 +6,27 @@ import csv
 import io
 import logging
 import os
-import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import FileFormatError, StorageError
-from mpcoffline.core.tables import Table
-from mpcoffline.core.text import markdown
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.learner.candidates import FULL
 from mpcoffline.learner.learner import OfflineMPCLearner
 
 from .plant_files import Loops, PlantFile
+
+if TYPE_CHECKING:
+    from mpcoffline.diagnostics import Report
 
 NAN = float("nan")
 MARGIN, CLOSE = 0.02, 0.05  # "worse" and "better" by more than this of |MPC_1|; "as good" within this of |yardstick|
@@ -69,8 +72,24 @@ class Outcome:
         ends_learned: The same of the learned MPC.
         fit_s: Time of the fit in s of one core.
         build_s: Time to build the learned MPC's solver, its compiler included, likewise.
+        candidate: What the learner handed out, by name; empty where it had one candidate alone.
+        choice_s: Time of the choice, a part of that of the fit.
+        over_behaviour: learned - behaviour, likewise: what runs today.
+        over_behaviour_error: Its standard error.
+        full: Cost of the whole fit, ``candidate="full"``; that of the learned MPC where it was handed out.
+        full_gain: full - MPC_1, likewise.
+        full_gain_error: Its standard error.
+        full_over_behaviour: full - behaviour, likewise.
         said: What the learner said of itself: its warnings.
-        verdict: That of ``diagnose``, where it was asked.
+        verdict: That of ``diagnose`` on the learned MPC, where it was asked.
+        reason: Its first reason.
+        warned: 1 if it says that the learned MPC is worse, or rather worse, than what runs today; else 0.
+        expected: What it expects an episode of the learned MPC to cost, where it simulates whole ones.
+        lowest: The lowest that it expects.
+        highest: The highest.
+        verdict_s: Time of the verdict in s of one core.
+        full_verdict: The verdict on the whole fit.
+        full_warned: Likewise.
         error: What went wrong; such a case is tried again.
     """
 
@@ -92,8 +111,24 @@ class Outcome:
     ends_learned: float = NAN
     fit_s: float = NAN
     build_s: float = NAN
+    candidate: str = ""
+    choice_s: float = NAN
+    over_behaviour: float = NAN
+    over_behaviour_error: float = NAN
+    full: float = NAN
+    full_gain: float = NAN
+    full_gain_error: float = NAN
+    full_over_behaviour: float = NAN
     said: str = ""
     verdict: str = ""
+    reason: str = ""
+    warned: float = NAN
+    expected: float = NAN
+    lowest: float = NAN
+    highest: float = NAN
+    verdict_s: float = NAN
+    full_verdict: str = ""
+    full_warned: float = NAN
     error: str = ""
 
     @property
@@ -115,6 +150,26 @@ class Outcome:
     def close(self) -> bool:
         """Whether it costs at most as much as the yardstick and 5 % of its size."""
         return self.short <= CLOSE * abs(self.yardstick)
+
+    @property
+    def full_better(self) -> bool:
+        """Whether the whole fit costs less than MPC_1, by more than 2 %."""
+        return self.full_gain < -MARGIN * abs(self.mpc_1)
+
+    @property
+    def full_worse(self) -> bool:
+        """Whether it costs more, by more than 2 %."""
+        return self.full_gain > MARGIN * abs(self.mpc_1)
+
+    @property
+    def over_today(self) -> bool:
+        """Whether the learned MPC costs more than the controllers that made the log, by more than 2 % of their cost."""
+        return self.over_behaviour > MARGIN * abs(self.behaviour)
+
+    @property
+    def full_over_today(self) -> bool:
+        """Whether the whole fit does."""
+        return self.full_over_behaviour > MARGIN * abs(self.behaviour)
 
     @property
     def room(self) -> bool:
@@ -151,7 +206,7 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
         found[column], found[f"ends_{column}"] = float(done.cost.mean()), float(done.success.mean())
         return done
 
-    loops("behaviour", None)
+    today = loops("behaviour", None)
     nominal = plant.module.mpc(seed)
     first = loops("MPC_1", MPCPolicy(nominal))
     best, truth = None, plant.module.truth()
@@ -159,11 +214,12 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
         best = loops("yardstick", MPCPolicy(truth))
     tell(f"fit of {len(table)} transitions")
     said: list[str] = []
+    learned_by: list[float] = []  # until here nothing was chosen
     learner = OfflineMPCLearner(nominal, learn=getattr(plant.module, "LEARN", "cost+model"), seed=seed)
     start = _core_seconds()
     with _heard(said):
-        learner.fit(table, show_progress=False)
-    found["fit_s"] = _core_seconds() - start
+        learner.fit(table, show_progress=False, callbacks=[lambda *_: learned_by.append(_core_seconds())])
+    found["fit_s"], found["choice_s"] = _core_seconds() - start, _core_seconds() - max(learned_by, default=start)
     found["said"] = _short("; ".join(dict.fromkeys(said)))
     tell("build of the solver")
     start = _core_seconds()
@@ -171,14 +227,58 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
     found["build_s"] = _core_seconds() - start
     learned = loops("learned", learner.policy)
     found["gain"], found["gain_error"] = paired(learned.cost, first.cost)
+    found["over_behaviour"], found["over_behaviour_error"] = paired(learned.cost, today.cost)
     if best is not None:
         found["short"], found["short_error"] = paired(learned.cost, best.cost)
+    found["candidate"] = "" if learner.candidates is None else learner.candidates.chosen
+    whole = taking(learner, FULL)
+    full = learned
+    if whole is not learner:
+        tell(f"{n} episodes of the whole fit")
+        full = plant.closed_loops(whole.policy, seed, n)
+    found["full"] = float(full.cost.mean())
+    found["full_gain"], found["full_gain_error"] = paired(full.cost, first.cost)
+    found["full_over_behaviour"], _ = paired(full.cost, today.cost)
     if case.diagnose:
-        from mpcoffline.diagnostics import diagnose
-
         tell("verdict")
-        report = diagnose(learner, table, seed=seed)
-        found["verdict"] = _short(f"{report.verdict}: {report.reasons[0] if report.reasons else ''}".rstrip(": "))
+        _judge(found, learner, whole, table, seed, plant.module.STEPS)
+
+
+def _judge(
+    found: dict[str, float | int | str],
+    learner: OfflineMPCLearner,
+    whole: OfflineMPCLearner,
+    table: TransitionTable,
+    seed: int,
+    n_steps: int,
+) -> None:
+    """What ``diagnose`` says of what was handed out, and of the whole fit."""
+    from mpcoffline.diagnostics import diagnose
+
+    start = _core_seconds()
+    report = diagnose(learner, table, seed=seed)
+    found["verdict_s"] = _core_seconds() - start
+    found["verdict"], found["reason"] = report.verdict, _short(report.reasons[0] if report.reasons else "")
+    if report.trials.n_steps == n_steps:
+        found["lowest"], found["expected"], found["highest"] = report.judgement.expected
+    found["warned"] = _warned(report)
+    other = report if whole is learner else diagnose(whole, table, seed=seed)
+    found["full_verdict"], found["full_warned"] = other.verdict, _warned(other)
+
+
+def _warned(report: Report) -> float:
+    today = report.judgement.today
+    return float(today.known and (today.worse or today.dearer))
+
+
+def taking(learner: OfflineMPCLearner, name: str) -> OfflineMPCLearner:
+    """The learner as if it had been asked for a candidate by name; itself where it has handed that out."""
+    if learner.candidates is None or learner.candidates.chosen == name:
+        return learner
+    other = copy(learner)
+    other.candidate, other.candidates = name, None
+    other._mpc, other._policy = learner.candidates[name], None
+    return other
 
 
 def _core_seconds() -> float:
@@ -271,97 +371,3 @@ def read(path: Path) -> list[Outcome]:
         outcome = Outcome(**values)  # type: ignore[arg-type]
         found[outcome.key] = outcome
     return list(found.values())
-
-
-class Summary(NamedTuple):
-    """Counts over all cases that have a result.
-
-    Attributes:
-        cases: Number of cases.
-        worse: Those where the learned MPC costs more than MPC_1 by more than 2 % of its size.
-        yardsticks: Number of cases with a yardstick.
-        close: Of these, those within 5 % of it.
-        room: Of these, those where the yardstick is better than MPC_1 by more than 2 %.
-        better: Of these, those where the learned MPC is, too.
-    """
-
-    cases: int
-    worse: list[Outcome]
-    yardsticks: int
-    close: int
-    room: int
-    better: int
-
-
-def summarised(outcomes: Sequence[Outcome]) -> Summary:
-    """The counts."""
-    done = [o for o in outcomes if not o.error]
-    measured = [o for o in done if not np.isnan(o.yardstick)]
-    room = [o for o in measured if o.room]
-    close, better = sum(o.close for o in measured), sum(o.better for o in room)
-    return Summary(len(done), [o for o in done if o.worse], len(measured), close, len(room), better)
-
-
-_HEADER = ["plant", "seed", "behaviour", "MPC_1", "yardstick", "learned", "learned - MPC_1", "learned - yardstick"]
-_HEADER += ["ends well: MPC_1/yardstick/learned", "fit (s)", "build (s)"]
-
-
-def report(outcomes: Sequence[Outcome]) -> str:
-    """A page in Markdown: the counts, those that became worse, and a line a case."""
-    rows = sorted(outcomes, key=lambda o: o.key)
-    s, failed = summarised(rows), [o for o in rows if o.error]
-    starts = ", ".join(str(n) for n in sorted({o.starts for o in rows})) or "no"
-    lines = [
-        "# Plants that nobody tuned for",
-        "",
-        f"`scripts/bench_zoo`: {s.cases} cases, each a plant file and a seed (of MPC_1's errors, the log, the learning,"
-        f" the starts), the default preset, no option set for any plant. Costs are means over {starts} starts that the"
-        " log does not hold, the same for all controllers; differences are paired, +- their standard error. The"
-        " yardstick is an MPC with the best model and the plant's own stage cost. What a plant file is:"
-        " [](../guides/plant_files.md).",
-        "",
-        f"* Worse than MPC_1 by more than 2 % of its cost: **{len(s.worse)} of {s.cases}**"
-        + "".join(f"; {o.plant} {o.seed} ({_pair(o.gain, o.gain_error)})" for o in s.worse),
-        f"* Within 5 % of the yardstick: **{s.close} of {s.yardsticks}**",
-        f"* Better than MPC_1 by more than 2 % where the yardstick is: **{s.better} of {s.room}**",
-        f"* Time in s of one core: fit {_range([o.fit_s for o in rows])};"
-        f" build of its solver {_range([o.build_s for o in rows])}",
-    ]
-    lines += [f"* Failed: {o.plant} {o.seed}: {o.error}" for o in failed]
-    judged = any(o.verdict for o in rows)
-    header = _HEADER + ["verdict"] * judged
-    cells = [_cells(o) + [o.verdict] * judged for o in rows]
-    table = Table(header, cells, align="lrrrrrrrrrr" + "l" * judged)
-    lines += ["", table.markdown(), "", *_sayings(rows)]
-    return "\n".join(lines).rstrip("\n") + "\n"
-
-
-def _sayings(rows: Sequence[Outcome]) -> list[str]:
-    """What the learner said, once a plant where only numbers differ; a column of it would make the table unreadable."""
-    first: dict[tuple[str, str], Outcome] = {}
-    for o in rows:
-        first.setdefault((o.plant, re.sub(r"[\d.]+", "", o.said)), o)
-    said = [f"* {o.plant} {o.seed}: {markdown(o.said)}" for o in first.values() if o.said]
-    intro = ["## What the learner said", "", "Where it is the same but for numbers, for the first seed.", ""]
-    return [*intro, *said] if said else []
-
-
-def _cells(o: Outcome) -> list[str]:
-    costs = [_number(cost) for cost in (o.behaviour, o.mpc_1, o.yardstick, o.learned)]
-    ends = "/".join("-" if np.isnan(e) else f"{e:.2f}" for e in (o.ends_mpc_1, o.ends_yardstick, o.ends_learned))
-    differences = [_pair(o.gain, o.gain_error), _pair(o.short, o.short_error)]
-    times = ["-" if np.isnan(t) else f"{t:.0f}" for t in (o.fit_s, o.build_s)]
-    return [o.plant, str(o.seed), *costs, *differences, ends, *times]
-
-
-def _number(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.5g}"
-
-
-def _pair(mean: float, error: float) -> str:
-    return "-" if np.isnan(mean) else f"{mean:+.3g} +- {error:.2g}"
-
-
-def _range(values: Sequence[float]) -> str:
-    known = [value for value in values if not np.isnan(value)]
-    return f"{min(known):.0f} to {max(known):.0f} (median {np.median(known):.0f})" if known else "-"

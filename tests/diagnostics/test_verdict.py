@@ -331,3 +331,16 @@ def test_the_table_holds_today_mpc_1_and_the_proposal() -> None:
     assert rows["today"][1] == pytest.approx(130.0)
     assert rows["learned"][0] < 80.0 < rows["learned"][2]
     assert all(low <= middle <= high for low, middle, high in rows.values())
+
+
+def test_a_candidate_that_left_the_choice_early_is_judged_by_the_starts_that_it_had() -> None:
+    tried = trials({"best": BETTER, "left": [-9.0] * 5})
+    cost, judged = tried.cost.copy(), np.arange(64) >= 40
+    cost[2, :, 6:] = np.nan
+    tried = replace(tried, cost=cost, second=cost, judged=judged)
+    best, left = (Difference.of(tried, name, "MPC_1") for name in ("best", "left"))
+    np.testing.assert_allclose(best.mean, (cost[1] - cost[0])[:, 40:].mean(axis=1))
+    np.testing.assert_allclose(left.mean, (cost[2] - cost[0])[:, :6].mean(axis=1))
+    assert [each.name for each in candidates(tried)] == ["best", "left"]
+    assert "24 starts" in judge(tried, "best")[1]
+    assert judge(tried, "left")[0] == "keep MPC_1"

@@ -16,7 +16,9 @@ import pytest
 from plant_file import TEXT
 
 from mpcoffline import FileFormatError, OfflineMPCLearner
-from mpcoffline.studies import zoo
+from mpcoffline.learner.candidates import Candidates
+from mpcoffline.studies import zoo, zoo_page
+from mpcoffline.studies.plant_files import PlantFile
 from mpcoffline.studies.zoo import Case, Outcome
 
 ROOT = Path(__file__).parents[2]
@@ -41,6 +43,10 @@ def test_a_case_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert done.gain_error > 0.0
     assert done.fit_s > 0.0
     assert done.yardstick < done.behaviour
+    assert done.over_behaviour == pytest.approx(done.learned - done.behaviour)
+    assert done.full == done.learned  # the recipe as published has no other candidate
+    assert done.candidate == ""
+    assert 0.0 <= done.choice_s < done.fit_s
     assert told[0] == "log"
     assert "8 episodes of learned" in told
 
@@ -100,11 +106,11 @@ def test_counts_know_no_sign_of_the_cost() -> None:
         outcome(1.0, np.nan, seed=5, gain=np.nan),  # no cost
         outcome(1.0, 9.0, seed=6, error="x"),
     ]
-    counts = zoo.summarised(rows)
+    counts = zoo_page.summarised(rows)
     assert counts.cases == 6
     assert [o.seed for o in counts.worse] == [1, 3, 5]
     assert (counts.yardsticks, counts.close, counts.room, counts.better) == (4, 3, 3, 2)
-    page = zoo.report(rows)
+    page = zoo_page.report(rows)
     assert "**3 of 6**; cart 1 (+3 +- 0.1); cart 3 (+3 +- 0.1); cart 5" in page
     assert "**3 of 4**" in page
     assert "**2 of 3**" in page
@@ -112,6 +118,51 @@ def test_counts_know_no_sign_of_the_cost() -> None:
         "## What the learner said\n\nWhere it is the same but for numbers, for the first seed.\n\n* cart 0: off by 3\n"
     )
     assert "Failed: cart 6: x" in page
+
+
+def test_verdicts_are_counted_against_the_truth() -> None:
+    def judged(learned: float, full: float, seed: int, verdict: str, full_verdict: str, **more: Any) -> Outcome:
+        known = {
+            "behaviour": 110.0, "over_behaviour": learned - 110.0, "full_over_behaviour": full - 110.0,
+            "full": full, "full_gain": full - 100.0, "candidate": "identified", "verdict": verdict,
+            "full_verdict": full_verdict, "reason": "why", "warned": 0.0, "full_warned": 1.0, "fit_s": 20.0,
+            "choice_s": 5.0, "verdict_s": 3.0,
+        }  # fmt: skip
+        return outcome(100.0, learned, seed=seed, **(known | more))
+
+    rows = [
+        judged(50.0, 120.0, 0, "recommend", "keep MPC_1", expected=52.0, lowest=45.0, highest=60.0),
+        judged(90.0, 90.0, 1, "try with care", "recommend", expected=80.0, lowest=70.0, highest=85.0),
+        judged(105.0, 130.0, 2, "recommend", "recommend"),
+        judged(120.0, 99.0, 3, "keep MPC_1", "keep MPC_1", warned=1.0),
+    ]
+    page = zoo_page.report(rows)
+    assert (
+        "Recommended, but worse than MPC_1 by more than 2 %: handed out **1** (cart 2), whole fit **1** (cart 2)"
+        in page
+    )
+    assert "and recommended: handed out **1 of 2**, whole fit **1 of 1**" in page
+    assert "worse than the controllers of the log by more than 2 %: handed out **0**, whole fit **1** (cart 2)" in page
+    assert "and the verdict says so: handed out **1 of 1**, whole fit **2 of 2**" in page
+    assert "median deviation **7.6%**" in page
+    assert "within the report's own band 1 of 2" in page
+    assert "worse than MPC_1 by more than 2 % in 2 of 4; better in 1, what was handed out in 2" in page
+    assert "verdict 3 to 3 (median 3); with fit 23 to 23" in page
+    assert "52 (45 to 60)" in page
+    assert "recommend: why" in page
+
+
+def test_a_whole_fit_is_what_the_learner_would_have_handed_out(tmp_path: Path) -> None:
+    (tmp_path / "cart.py").write_text(TEXT)
+    nominal = PlantFile.load(tmp_path / "cart.py").module.mpc(0)
+    learner = OfflineMPCLearner(nominal)
+    assert zoo.taking(learner, "full") is learner
+    learner._mpc, full = nominal, nominal.replace(horizon=3)
+    learner.candidates = Candidates({"MPC_1": nominal, "full": full}, "MPC_1")
+    other = zoo.taking(learner, "full")
+    assert other.mpc is other.policy.mpc is full
+    assert other.candidate == "full"
+    assert learner.mpc is nominal
 
 
 @pytest.fixture
