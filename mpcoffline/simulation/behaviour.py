@@ -17,8 +17,8 @@ from mpcoffline.estimation.structure import HeldOut, clearly_negative
 from mpcoffline.mpc.layout import Layout
 from mpcoffline.mpc.scaling import cost_spread
 
-from .closed_loop import signals_along
 from .models import LogModels
+from .starts import signals_along
 
 _ROWS = 10_000
 _HIDDEN = (8, 8)

@@ -37,14 +37,15 @@ def signals_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int, 
     Where an episode ends before, its signals go on as they would along a horizon.
     """
     n, ny, length = layout.n_states, layout.ny, len(table)
-    moved = layout.sources[: ny - n] - n
     reached, ids = table.next_observations[:, n:ny], table.episode_ids
     now = np.asarray(table.observations[rows, n:ny], dtype=np.float64)
     found, goes_on = [], np.ones(len(rows), dtype=bool)
+    still, none = np.zeros((len(rows), n)), np.zeros((len(rows), layout.n_memory + layout.nu))
     for k in range(n_steps):
         row = np.minimum(rows + k, length - 1)
         goes_on &= (rows + k < length) & (ids[row] == ids[rows])
-        now = np.where(goes_on[:, None], reached[row], now[:, moved])
+        z, u = np.split(np.hstack([still, now, none]), [layout.nx], axis=1)
+        now = np.where(goes_on[:, None], reached[row], layout.joined(still, z, u)[:, n:ny])
         found.append(now)
     return np.stack(found, axis=1)
 
