@@ -73,7 +73,7 @@ def test_a_disturbance_of_the_log_meets_every_controller_again() -> None:
             self.k += 1
             return np.broadcast_to(action, (len(observation), 1)), None
 
-    np.testing.assert_allclose(around.act(Replay()).states[0, 1:], log.next_observations, atol=2e-3)  # but outliers
+    np.testing.assert_allclose(around.act(Replay()).states[0, 1:], log.next_observations, atol=1e-2)  # but outliers
 
 
 def test_a_state_that_runs_away_is_lost_and_dear() -> None:
@@ -160,7 +160,8 @@ def test_the_best_of_some_is_chosen_and_the_worse_leave_early() -> None:
 
 def test_variants_of_what_is_good_are_tried_too() -> None:
     around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 30)
-    mpcs = {FIRST: lq_plant.make_mpc(), "lazy": TRUE_MPC.replace(horizon=1)}
-    trials, chosen = choose(mpcs, around, lambda name, _: {f"{name}, farther": TRUE_MPC})
-    assert chosen == "lazy, farther"
-    assert trials.names == tuple(mpcs) == (FIRST, "lazy", "lazy, farther")
+    still, half = (lq_plant.make_mpc((share * lq_plant.A, lq_plant.B)) for share in (0.1, 0.5))
+    mpcs = {FIRST: still, "half": half}
+    trials, chosen = choose(mpcs, around, lambda name, _: {f"{name}, whole": TRUE_MPC})
+    assert chosen == "half, whole"
+    assert trials.names == tuple(mpcs) == (FIRST, "half", "half, whole")
