@@ -114,6 +114,7 @@ def diagnose(
     first, second = loops[0], loops[-1]
     lag, cost = lag_check(identified, clean), around.cost
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
+    choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(
         trials,
         chosen,
@@ -122,12 +123,14 @@ def diagnose(
         n_rows=len(table),
         cost_r2=cost.r2,
         failed=failed[1],
+        choice=choice,
         rules=tuple(rules),
     )
     reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
     report = Report(
         judgement=judgement,
         trials=trials,
+        choice=choice,
         notes=(),
         cost_r2=cost.r2,
         value=value_check(learner.value_function, clean, learned.discount),

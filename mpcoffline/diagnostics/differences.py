@@ -175,9 +175,9 @@ def candidates(trials: Trials) -> tuple[Candidate, ...]:
     """All controllers that were tried but MPC_1, the cheapest first; none where no model has a vote."""
     found = []
     for i, name in enumerate(trials.names[1:], 1):
-        d = Difference.of(trials, name, trials.names[0])
-        if len(d):
-            k, starts = d.middle, starts_of(trials, name)
+        d, starts = Difference.of(trials, name, trials.names[0]), starts_of(trials, name)
+        if len(d) and starts.any():
+            k = d.middle
             cost, _ = paired(trials.cost[i][trials.votes][:, starts], np.zeros((len(d), int(starts.sum()))))
             lost = float(trials.lost[i][trials.votes][:, starts].mean())
             levels = float(cost[k]), float(d.mean[k]), float(d.error[k])

@@ -42,13 +42,19 @@ class Traces:
 
 
 def draw(
-    judgement: Judgement, trials: Trials, value: ValueCheck, fit: tuple[RegionError, ...], traces: Traces
+    judgement: Judgement,
+    trials: Trials,
+    choice: Trials,
+    value: ValueCheck,
+    fit: tuple[RegionError, ...],
+    traces: Traces,
 ) -> Figure:
     """Draws candidates, costs, models against the log, closed loops, V against returns, and the error of (FIT).
 
     Args:
         judgement: What the report says.
-        trials: The controllers that were tried.
+        trials: What was judged and what it was compared with.
+        choice: All candidates.
         value: V_phi against measured returns.
         fit: The error of (FIT) by region.
         traces: What is not in the report's text.
@@ -57,7 +63,7 @@ def draw(
         figure = new_figure(PAGE_WIDTH, _HEIGHT)
         axes = figure.subplots(3, 2)
         figure.suptitle(f"Verdict: {judgement.verdict}", fontsize=10, fontweight="bold", x=0.01, ha="left")
-        _draw_candidates(axes[0, 0], judgement, trials)
+        _draw_candidates(axes[0, 0], judgement, choice)
         _draw_costs(axes[0, 1], judgement, trials)
         _draw_agreement(axes[1, 0], judgement, trials)
         _draw_distances(axes[1, 1], traces)

@@ -56,6 +56,7 @@ def decide(
     n_rows: int | None = None,
     cost_r2: float = 1.0,
     failed: float = 0.0,
+    choice: Trials | None = None,
     rules: tuple[str, ...] = DEFAULT_RULES,
 ) -> Judgement:
     """The verdict and why.
@@ -74,6 +75,7 @@ def decide(
         n_rows: Transitions in the data, likewise.
         cost_r2: Share of the logged costs' variance that the simulated cost explains, likewise.
         failed: Share of the proposal's problems that were not solved at first.
+        choice: The trials in which the proposal was chosen, if they are others: what else was tried.
         rules: Names of the rules of :data:`RULES` that may withhold a recommendation.
 
     Returns:
@@ -87,7 +89,7 @@ def decide(
     if not trials.votes.any():
         return Judgement("keep MPC_1", tuple(doubts), proposal, None, today, expected)
     if proposal == trials.names[0]:
-        reasons = (_nothing_better(trials), *_of_today(today, trials, proposal))
+        reasons = (_nothing_better(choice or trials), *_of_today(today, trials, proposal))
         return Judgement("keep MPC_1", reasons, proposal, Difference.of(trials, proposal, proposal), today, expected)
     first = Difference.of(trials, proposal, trials.names[0])
     told = [*_of_today(today, trials, proposal), *gone_wrong(evidence), *_failures(failed)]
