@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style
 from mpcoffline.simulation.trials import Trials
 
-from .differences import SURE, TODAY, Difference, candidates, outvoted
+from .differences import SURE, TODAY, Difference, candidates, outvoted, whole_episodes
 from .measures import RegionError, ValueCheck
 from .verdict import Judgement, costs_of
 
@@ -125,7 +125,7 @@ def _draw_costs(axes: Axes, judgement: Judgement, trials: Trials) -> None:
 def _draw_agreement(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     """Each start: what the log cost from there, and its controller's clone on the models."""
     axes.set_title("Models against the log", loc="left")
-    known = np.isfinite(trials.returns)
+    known = np.isfinite(trials.returns) & whole_episodes(trials)
     if TODAY not in trials.names or not known.any() or not trials.votes.any():
         _say(axes, "no logged episode is as long" if not known.any() else "the logged controller\nwas not simulated")
         return

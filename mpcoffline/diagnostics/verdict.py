@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
 
-from .differences import SURE, TODAY, Difference, Today, outvoted, paired, starts_of
+from .differences import SURE, TODAY, Difference, Today, outvoted, paired, starts_of, whole_episodes
 from .measures import LagCheck
 from .withholding import DEFAULT_RULES, RULES, Evidence, gone_wrong
 
@@ -130,7 +130,7 @@ def _costs(trials: Trials, name: str, first: Difference, k: int) -> Array:
 
 def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
     """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts."""
-    costs = trials.of(proposal)[trials.votes]
+    costs = trials.of(proposal)[trials.votes][:, whole_episodes(trials)]
     mean, error = paired(costs, np.zeros_like(costs))
     known = np.isfinite(mean) & np.isfinite(error)
     if not known.any():

@@ -6,6 +6,7 @@ from .delays import DelaySearch, find_delays
 from .episodes import EpisodeSpread
 from .identification import IdentificationConfig
 from .identifying import Identification, identify
+from .profiles import with_profiles
 from .residual import Residual, fit_residual, fit_residuals, with_residual
 from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
 from .structure import MultiStepCheck
@@ -25,5 +26,6 @@ __all__ = [
     "identify",
     "smooth",
     "with_measurement_noise",
+    "with_profiles",
     "with_residual",
 ]

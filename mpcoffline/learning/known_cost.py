@@ -93,12 +93,13 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
     return replace(known, cost=found)
 
 
-def agreeing_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | None:
+def agreeing_cost(mpc: MPC, table: TransitionTable, *, count: int = 4_000) -> tuple[MPC, KnownCost] | None:
     """The MPC whose stage cost the logged costs are: the given one, or one with other weights; and the relation.
 
     Args:
         mpc: Its stage cost is Lhat.
         table: Transitions as logged, see :func:`known_cost`.
+        count: From how many of them the weights are found.
 
     Returns:
         None where no weights make it so.
@@ -106,7 +107,7 @@ def agreeing_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | N
     found = known_cost(mpc, table)
     if found is not None:
         return mpc, found
-    other = _with_fitted_weights(mpc, table)
+    other = _with_fitted_weights(mpc, table, count)
     found = None if other is None else known_cost(other, table, noise=False)
     return None if other is None or found is None else (other, found)
 
@@ -267,9 +268,9 @@ def _explained(inputs: Array, residual: Array) -> float:
     return 1.0 - float(np.mean(missed**2)) / variance if variance > 0.0 else 0.0
 
 
-def _with_fitted_weights(mpc: MPC, table: TransitionTable) -> MPC | None:
+def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int) -> MPC | None:
     """The MPC with the cost parameters that are nearest to the logged costs; None where there are none."""
-    few = table.sample(4_000, 0)
+    few = table.sample(count, 0)
     columns, centre = few.values(), table.centring.centre[: table.ny]
     scaling = Scaling.of(columns.observations, columns.actions, columns.costs, columns.next_observations, centre)
     coordinates = Coordinates(mpc, ("cost",), scaling)

@@ -34,7 +34,7 @@ class Coordinates:
         space = mpc.space
         self.mask = space.mask(groups)
         theta, low, high = (v[self.mask] for v in (space.theta, space.low, space.high))
-        factor = np.concatenate([np.full(block.size, block.kind == "psd") for block in space])[self.mask]
+        factor = np.array([b.kind == "psd" for b in space for _ in range(b.size)], dtype=bool)[self.mask]
         self._stuck = factor & (low == 0.0) & (theta == 0.0)
         low = np.where(factor, -np.inf, low)
         self._bounds = np.stack([low, high], axis=1)

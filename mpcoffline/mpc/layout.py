@@ -23,7 +23,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.types import Array
 
-from .signals import Named, Signal
+from .signals import Named, Signal, after_the_last, turned
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class Layout:
 
         z = [x, signals, u_0[k-1], u_0[k-2], ..., u_1[k-1], ...]     as many of each input as ``carried`` says
 
-    Signals move along a horizon as they were previewed, and stay at the last value that is known.
+    Signals move along a horizon as they were previewed, and stay at the last value that is known; clocks turn, and what
+    follows one goes on by its profile (:meth:`ahead`).
 
     Attributes:
         n_states: Number of the plant's states.
@@ -64,6 +65,9 @@ class Layout:
         names = [signal.name for signal in self.signals]
         if len(set(names)) < len(names):
             raise InvalidArgumentError("names of signals", expected="unique names", actual=str(names))
+        clocks = [signal.name for signal in self.signals if signal.period is not None]
+        if lost := [signal.follows for signal in self.signals if signal.follows not in (None, *clocks)]:
+            raise InvalidArgumentError("follows", expected=f"a clock among {clocks}", actual=repr(lost[0])[:100])
         what = "of them, with signals and past inputs" if self.nx > self.n_states else "of them"
         check_limit("nx", what, self.nx, limits.STATES, error=InvalidArgumentError)
 
@@ -114,7 +118,7 @@ class Layout:
     @property
     def usual_signals(self) -> Array:
         """The columns of the signals where none is known, ``(ny - n_states,)``."""
-        return np.concatenate([np.zeros(0), *(np.full(signal.size, signal.usual) for signal in self.signals)])
+        return np.array([value for signal in self.signals for value in signal.usual_values], dtype=np.float64)
 
     @property
     def n_memory(self) -> int:
@@ -187,6 +191,26 @@ class Layout:
         """Names of the entries of the memory, as ``"u0[k-2]"``."""
         return tuple(f"u{i}[k-{age}]" for i, age in zip(*self.ages, strict=True))
 
+    def ahead(self, y: Any) -> dict[int, Any]:
+        """The next values of the entries of y that go on by a law of their own, by their place.
+
+        Args:
+            y: Observations, entries along the first axis: a CasADi column, or an array ``(ny, ...)``.
+        """
+        found: dict[int, Any] = {}
+        clocks: dict[str | None, tuple[tuple[Any, Any], float]] = {}
+        for signal, at in zip(self.signals, self.present.tolist(), strict=True):
+            if signal.period is not None:
+                step = 2.0 * np.pi / signal.period
+                clocks[signal.name] = (y[at], y[at + 1]), step
+                found[at], found[at + 1] = turned(y[at], y[at + 1], step)
+        for signal, at in zip(self.signals, self.present.tolist(), strict=True):
+            if signal.profile:
+                phase, step = clocks[signal.follows]
+                end = at + signal.preview
+                found[end] = after_the_last(signal, y[end], turned(*phase, signal.preview * step), step)
+        return found
+
     def wrapped(self, plant: ca.Function) -> ca.Function:
         """The map (z, u, p) -> z+ around the plant's map (x, acting inputs, p) -> x+."""
         if self.is_plain:
@@ -195,6 +219,8 @@ class Layout:
         every = ca.vertcat(z, u)
         reached = plant(z[: self.n_states], every[self.acting.tolist()], p)
         moved = ca.vertcat(reached, every[self.sources.tolist()])
+        for place, value in self.ahead(z).items():
+            moved[place] = value
         return ca.Function("model", [z, u, p], [moved], ["x", "u", "p"], ["x_next"])
 
     def split(self, z: Array, u: Array) -> tuple[Array, Array]:
@@ -203,7 +229,10 @@ class Layout:
 
     def joined(self, reached: Array, z: Array, u: Array) -> Array:
         """z+ ``(..., nx)`` of the plant's next states ``(..., n_states)``, from z and u."""
-        return np.concatenate([reached, np.concatenate([z, u], axis=-1)[..., self.sources]], axis=-1)
+        joined = np.concatenate([reached, np.concatenate([z, u], axis=-1)[..., self.sources]], axis=-1)
+        for place, value in self.ahead(np.moveaxis(z, -1, 0)).items():
+            joined[..., place] = value
+        return joined
 
     def remembered(self, memory: Array, u: Array) -> Array:
         """The memory ``(..., n_memory)`` after inputs u ``(..., nu)`` were applied."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import casadi as ca
@@ -204,6 +205,12 @@ class Model(Component):
         other = copy.copy(self)
         other._lay_out(self.layout.with_delay(delay), self.plant)
         other.delay = None if delay is None else other.layout.delay
+        return other
+
+    def with_signals(self, signals: Sequence[Signal]) -> Self:
+        """The same model with signals of the same names and columns that go on otherwise, as by learned profiles."""
+        other = copy.copy(self)
+        other._lay_out(replace(self.layout, signals=tuple(signals)), self.plant)
         return other
 
     def with_previous(self) -> Self:

@@ -21,6 +21,10 @@ _HIDDEN = (10, 10)
 _NETWORK_ROWS = 6_000
 _HELD_OUT = ((0, 1), (1, 0))  # folds that each network is judged by, and ends by
 _EXACT = 1e-6  # share of the variance that rounding may leave open
+_INNER = 0.8  # share of the rows, from which a quadratic must predict the outer ones to be believed beyond all
+_AS_GOOD = 2.0  # times the squared error that it has when it has seen others of them
+_NEXT_TO_NONE = 0.01  # of the variance of the outer ones, which is good enough in any case
+_WIDER = 2.0
 _BETTER = 0.75  # times the squared error of the quadratic on held-out episodes, which is worth another regression
 
 
@@ -58,9 +62,9 @@ Regressed = Fitted | Corrected
 
 @dataclass(frozen=True)
 class CostRegression:
-    """A cost as a function of x = (s, a): a regression g within the box of the logged x, and beyond what q adds.
+    """A cost as a function of x = (s, a): a regression g within a box, and beyond it what a quadratic q adds.
 
-    With c for x moved into the box, and a quadratic q::
+    With c for x moved into the box, which holds all logged x::
 
         L(x) = level + scale (g(c) + max(0, q(x) - q(c)))
 
@@ -124,12 +128,12 @@ def cost_regressions(x: Array, cost: Array, folds: NDArray[np.intp], seed: int) 
     level, scale = float(cost.mean()), cost_spread(cost)
     y = (cost - level) / scale
     variance = float(np.mean(y**2)) or 1.0
-    low, high = x.min(axis=0), x.max(axis=0)
 
     def regression(name: str, g: Regressed, q: Regressed, missed: Array) -> CostRegression:
         return CostRegression(name, level, scale, g, q, low, high, float(np.mean(missed**2)) / variance)
 
     q = _fitted(RandomFeatures(x, 0, rng), x, y, folds)
+    low, high = _believed(x, y, folds, q)
     quadratic = regression("a quadratic", q, q, q.missed)
     if quadratic.exact or len(np.unique(folds)) < _FOLDS:
         return (quadratic,)
@@ -182,6 +186,25 @@ def _path(n: Array, sums: Array, gram: Array, slope: Array) -> tuple[Array, Arra
     along = axes.T @ (slope - n * means[:-1] * means[-1])
     weights = axes @ (along[:, None] / (np.maximum(strengths, 0.0)[:, None] + penalties))
     return weights, means[-1] - means[:-1] @ weights
+
+
+def _believed(x: Array, y: Array, folds: NDArray[np.intp], q: Fitted) -> tuple[Array, Array]:
+    """The corners of the box of the logged x; one twice as wide, where the log shows that a quadratic goes on so.
+
+    That is: where one that is learned from the inner rows predicts the outer ones.
+    """
+    middle, low, high = x.mean(axis=0), x.min(axis=0), x.max(axis=0)
+    distance = np.abs((x - middle) / np.where(high > low, high - low, 1.0)).max(axis=1)
+    limit = float(np.quantile(distance, _INNER))
+    inner, outer = np.flatnonzero(distance <= limit), np.flatnonzero(distance > limit)
+    if not limit > 0.0 or not len(outer):
+        return low, high
+    features = RandomFeatures(x[inner], 0, np.random.default_rng(0))
+    missed = y[outer] - _fitted(features, x[inner], y[inner], folds[inner])(x[outer])
+    allowed = max(_AS_GOOD * float(np.mean(q.missed[outer] ** 2)), _NEXT_TO_NONE * float(np.var(y[outer])))
+    if not np.mean(missed**2) <= allowed:
+        return low, high
+    return middle + _WIDER * (low - middle), middle + _WIDER * (high - middle)
 
 
 def _network(

@@ -16,6 +16,7 @@ from .cost_ends import learned_ends
 from .cost_regression import cost_regressions, folds_of
 
 _ROWS = 20_000
+_FEW = 1_000  # for other weights, which agree with all rows or are none
 
 
 class LoggedCost:
@@ -125,7 +126,7 @@ class LoggedCost:
 
 def _agreeing(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | None:
     """The MPC whose stage cost agrees with all logged costs, if there is one."""
-    found = agreeing_cost(mpc, table)
+    found = agreeing_cost(mpc, table, count=_FEW)
     return None if found is None or found[1].constant or found[1].agreeing < 1.0 else found
 
 

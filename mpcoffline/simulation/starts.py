@@ -9,14 +9,26 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc.layout import Layout
 
+_FEW = 5  # episodes
+_EARLY = 0.2  # of an episode
+
 
 def initial_rows(table: TransitionTable, count: int, seed: int) -> NDArray[np.intp]:
-    """Rows in which the log's own episodes began, at random; further rows where there are too few episodes."""
-    rng = np.random.default_rng(seed)
-    chosen = rng.permutation(table.episodes.firsts)[:count]
-    if len(chosen) < count:
-        chosen = np.concatenate([chosen, rng.integers(len(table), size=count - len(chosen))])
-    return np.sort(chosen)
+    """Rows in which the log's own episodes began, in random order.
+
+    Where there are too few, further ones early in an episode, which are nearly such; of a log of hardly any episodes
+    rows anywhere.
+    """
+    rng, (_, firsts, lengths) = np.random.default_rng(seed), table.episodes
+    chosen = rng.permutation(firsts)[:count]
+    more = count - len(chosen)
+    if more and len(firsts) < _FEW:
+        chosen = np.concatenate([chosen, rng.integers(len(table), size=more)])
+    elif more:
+        k = rng.integers(len(firsts), size=more)
+        late = np.ceil(_EARLY * rng.uniform(size=more) * lengths[k]).astype(np.intp)
+        chosen = np.concatenate([chosen, firsts[k] + np.minimum(late, lengths[k] - 1)])
+    return np.asarray(rng.permutation(chosen), dtype=np.intp)
 
 
 def signals_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int, layout: Layout) -> Array:
@@ -25,14 +37,15 @@ def signals_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int, 
     Where an episode ends before, its signals go on as they would along a horizon.
     """
     n, ny, length = layout.n_states, layout.ny, len(table)
-    moved = layout.sources[: ny - n] - n
     reached, ids = table.next_observations[:, n:ny], table.episode_ids
     now = np.asarray(table.observations[rows, n:ny], dtype=np.float64)
     found, goes_on = [], np.ones(len(rows), dtype=bool)
+    still, none = np.zeros((len(rows), n)), np.zeros((len(rows), layout.n_memory + layout.nu))
     for k in range(n_steps):
         row = np.minimum(rows + k, length - 1)
         goes_on &= (rows + k < length) & (ids[row] == ids[rows])
-        now = np.where(goes_on[:, None], reached[row], now[:, moved])
+        z, u = np.split(np.hstack([still, now, none]), [layout.nx], axis=1)
+        now = np.where(goes_on[:, None], reached[row], layout.joined(still, z, u)[:, n:ny])
         found.append(now)
     return np.stack(found, axis=1)
 

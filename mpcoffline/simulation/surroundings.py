@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, smooth
@@ -59,10 +57,9 @@ def surroundings_of(
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
-    if n_starts is None:  # half of them where an episode began: later the log is nearer to where a controller rests
+    if n_starts is None:
         n_starts = min(most_starts, max(STARTS // 2, 2 * clean.n_episodes))
     rows = initial_rows(clean, n_starts, seed)
-    rows = np.random.default_rng([seed, 1]).permutation(rows)  # those that judge are like those that choose
     if n_steps is None:
         n_steps = min(most_steps, max(int(table.episodes.lengths.max()), _HORIZONS * mpc.horizon))
     return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)

@@ -5,14 +5,11 @@ from __future__ import annotations
 import lq_plant
 import numpy as np
 import pytest
-from late_plants import belt_mpc
 from lq_episodes import episodes
 from lq_plant import BEST, DISCOUNT, QuadraticValue
 from numpy.typing import NDArray
 
-from mpcoffline import MPCPolicy
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.diagnostics.measures import (
     bound_names,
     fit_errors,
@@ -27,8 +24,6 @@ from mpcoffline.diagnostics.stability import closed_loop_eigenvalues, value_grow
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
-from mpcoffline.simulation.closed_loop import initial_states, simulate
-from mpcoffline.simulation.ensemble import Ensemble
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.solvers import make_solver
 
@@ -94,86 +89,6 @@ def test_a_constant_cost_is_learned() -> None:
 
 
 # ---------------------------------------------------------------- ensemble and simulation
-
-
-def test_the_first_member_is_the_identified_model_and_the_others_are_near() -> None:
-    mpc = lq_plant.make_mpc()
-    ensemble = Ensemble(mpc, LOG, identify_one_step(mpc, LOG), seed=0)
-    rng = np.random.default_rng(1)
-    x, u = rng.uniform(-1, 1, (7, 2)), rng.uniform(-1, 1, (7, 1))
-    reached = ensemble.step(np.broadcast_to(x, (11, 7, 2)), np.broadcast_to(u, (11, 7, 1)))
-    assert len(ensemble) == 11
-    expected = x @ lq_plant.A.T + u @ lq_plant.B.T
-    np.testing.assert_allclose(reached[0], expected, atol=1e-6)
-    distances = np.abs(reached - expected).max(axis=(1, 2))
-    assert (distances[1:6] > 1e-4).all()  # perturbed, though the data leave no doubt
-    assert (distances < 0.1).all()
-    again = Ensemble(mpc, LOG, identify_one_step(mpc, LOG), seed=0)
-    np.testing.assert_array_equal(again.thetas, ensemble.thetas)
-
-
-def test_residual_members_know_what_the_structure_misses() -> None:
-    mpc, log = lq_plant.make_mpc(), episodes(n=60, friction=0.1)
-    ensemble = Ensemble(mpc, log, identify_one_step(mpc, log))
-    test = episodes(n=20, friction=0.1, seed=9)
-    s, a, reached = (v.astype(np.float64) for v in (test.observations, test.actions, test.next_observations))
-    predicted = ensemble.step(np.broadcast_to(s, (11, *s.shape)), np.broadcast_to(a, (11, *a.shape)))
-    errors = np.sqrt(np.mean((predicted - reached) ** 2, axis=(1, 2)))
-    assert errors[6:].max() < 0.5 * errors[:6].min()
-
-
-def test_a_simulation_is_the_closed_loop_of_the_optimal_gain() -> None:
-    ensemble = Ensemble(TRUE_MPC, LOG, identify_one_step(TRUE_MPC, LOG), n_perturbed=0, n_residual=0)
-    starts = initial_states(LOG, 5, 0)
-    cost = LoggedCost(LOG)
-    result = simulate(MPCPolicy(TRUE_MPC), ensemble, cost, LOG, starts, 40)
-    x, expected = starts, np.zeros(5)
-    for _ in range(40):
-        u = x @ BEST.K.T
-        expected += lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)
-        x = x @ lq_plant.A.T + u @ lq_plant.B.T
-    np.testing.assert_allclose(result.cost[0], expected - 40 * cost.low, rtol=1e-3, atol=1e-2)
-    assert result.success.all()
-    assert not result.lost.any()
-    assert result.states.shape == (5, 41, 2)
-
-
-def test_a_state_that_runs_away_is_lost_and_dear() -> None:
-    unstable = lq_plant.make_mpc((3.0 * np.eye(2), np.zeros((2, 1))))
-    known = identify_one_step(unstable, LOG)
-    ensemble = Ensemble(
-        unstable, LOG, type(known)(unstable.theta, *list(vars(known).values())[1:]), n_perturbed=0, n_residual=0
-    )
-    starts = np.array([[0.5, 0.5], [0.0, 0.0]])
-    result = simulate(MPCPolicy(TRUE_MPC), ensemble, LoggedCost(LOG), LOG, starts, 30)
-    assert result.lost.tolist() == [[True, False]]
-    assert not result.success[0, 0]
-    assert result.cost[0, 0] > 10 * LOG.costs.max()
-    assert np.isfinite(result.cost).all()
-
-
-def test_past_inputs_that_the_log_hardly_varied_are_no_state_that_runs_away() -> None:
-    """The log holds a belt's input near 0.1; the policy needs up to 1, one step late."""
-    mpc, rng, parts = belt_mpc(1, gain=0.5, decay=0.9), np.random.default_rng(0), []
-    for e in range(30):
-        x, before = rng.uniform(0.0, 5.0), 0.1
-        for _ in range(20):
-            u, reached = 0.1 + 0.002 * rng.normal(), 0.9 * x + 0.5 * before + 0.1
-            parts.append(([x], [u], (x - 3.0) ** 2 + 0.02 * u**2, [reached], False, e))
-            x, before = reached, u
-    log = with_memory(TransitionTable.from_arrays(*(np.array(part) for part in zip(*parts, strict=True))), mpc.layout)
-    ensemble = Ensemble(mpc, log, identify_one_step(mpc, log), n_perturbed=0, n_residual=0)
-    result = simulate(MPCPolicy(mpc), ensemble, LoggedCost(log, seen=1), log, np.array([[0.5, 0.1]]), 30)
-    assert result.actions.max() > 0.9
-    assert not result.lost.any()
-    assert result.states[0, -1, 0] == pytest.approx(3.0, abs=0.3)
-
-
-def test_starts_are_those_of_the_log() -> None:
-    starts = initial_states(LOG, 12, 3)
-    firsts = LOG.observations[::30].astype(np.float64)
-    assert all((firsts == start).all(axis=1).any() for start in starts)
-    assert initial_states(LOG, 50, 0).shape == (50, 2)  # more than there are episodes
 
 
 # ---------------------------------------------------------------- measures

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.estimation import with_profiles
 from mpcoffline.learning.known_cost import CostConfig, with_known_cost
 from mpcoffline.learning.method import METHODS, Method
 from mpcoffline.learning.stages import Change, Known, Stage
@@ -59,8 +60,8 @@ class Bellman(Method):
             )
 
     def prepared(self, known: Known) -> Known:
-        """The dead time of the inputs, found in the data or checked (``init="identified"``)."""
-        return with_dead_time(known, self.identify)
+        """Profiles of signals; and dead time of the inputs, found in the data or checked (``init="identified"``)."""
+        return with_dead_time(replace(known, mpc=with_profiles(known.mpc, known.table)), self.identify)
 
     def candidates(self, known: Known) -> dict[str, MPC]:
         """The identified model with the costs that were given, and with V; see :func:`candidates`."""

@@ -1,0 +1,167 @@
+"""Trials on models of a log against closed loops and sums that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import lq_plant
+import numpy as np
+import pytest
+from late_plants import belt_mpc
+from lq_episodes import episodes
+from lq_plant import BEST
+from numpy.typing import NDArray
+
+from mpcoffline import MPCPolicy
+from mpcoffline.core.errors import FileFormatError
+from mpcoffline.datasets import TransitionTable
+from mpcoffline.datasets.table.memory import with_memory
+from mpcoffline.estimation.identification import identify_one_step
+from mpcoffline.mpc import MPC
+from mpcoffline.simulation.choice import FIRST, choose
+from mpcoffline.simulation.logged_cost import LoggedCost
+from mpcoffline.simulation.models import LogModels
+from mpcoffline.simulation.starts import initial_rows, returns_along
+from mpcoffline.simulation.trials import Surroundings, Trials
+
+Array = NDArray[np.float64]
+
+LOG = episodes()
+TRUE_MPC = lq_plant.make_mpc((lq_plant.A, lq_plant.B))
+
+
+def place(mpc: MPC, log: TransitionTable, rows: list[int], n_steps: int, members: int = 0) -> Surroundings:
+    found = identify_one_step(mpc, log)
+    models = LogModels.of(mpc, log, found, n_perturbed=members, n_residual=0)
+    return Surroundings(models, LoggedCost(log, seen=mpc.ny), log, np.array(rows), n_steps, mpc.layout)
+
+
+def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
+    around = place(TRUE_MPC, LOG, [0, 30, 60, 90, 120], 40)
+    done = around.act(MPCPolicy(TRUE_MPC))
+    x, expected = LOG.observations[[0, 30, 60, 90, 120]].astype(np.float64), np.zeros(5)
+    for _ in range(40):
+        u = x @ BEST.K.T
+        expected += lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)
+        x = x @ lq_plant.A.T + u @ lq_plant.B.T
+    np.testing.assert_allclose(done.cost[0], expected, rtol=1e-3, atol=1e-2)
+    np.testing.assert_allclose(done.second, done.cost)  # a quadratic is exact: there is no other opinion
+    assert not done.lost.any()
+    assert done.states.shape == (5, 41, 2)
+    some = around.act(MPCPolicy(TRUE_MPC), slice(1, 3))
+    np.testing.assert_allclose(some.cost, done.cost[:, 1:3], rtol=1e-6)
+
+
+def test_a_disturbance_of_the_log_meets_every_controller_again() -> None:
+    """The logged inputs on the exact model give the logged states, whatever disturbed them."""
+    rng = np.random.default_rng(0)
+    pushed = LOG.values()
+    push = 0.01 * rng.standard_normal(pushed.next_observations.shape)
+    x, rows = LOG.observations[0].astype(np.float64), []
+    for k in range(30):
+        reached = lq_plant.A @ x + lq_plant.B @ pushed.actions[k] + push[k]
+        rows.append((x, pushed.actions[k], 0.0, reached, 0.0))
+        x = reached
+    log = TransitionTable.from_arrays(*(np.array(part) for part in zip(*rows, strict=True)))
+    around = place(TRUE_MPC, log, [0], 30)
+
+    class Replay:
+        k = 0
+
+        def predict(self, observation: Array, state: object = None) -> tuple[Array, None]:
+            action = log.actions[self.k].astype(np.float64)
+            self.k += 1
+            return np.broadcast_to(action, (len(observation), 1)), None
+
+    np.testing.assert_allclose(around.act(Replay()).states[0, 1:], log.next_observations, atol=1e-2)  # but outliers
+
+
+def test_a_state_that_runs_away_is_lost_and_dear() -> None:
+    unstable = lq_plant.make_mpc((3.0 * np.eye(2), np.zeros((2, 1))))
+    log = LOG.take(np.arange(60))
+    around = place(unstable, log, [0, 30], 30)
+    around.starts[1], around.disturbances[:] = 0.0, 0.0
+    done = around.act(MPCPolicy(TRUE_MPC))
+    assert done.lost.tolist() == [[True, False]]
+    assert done.cost[0, 0] > 10 * log.costs.max()
+    assert np.isfinite(done.cost).all()
+
+
+def test_past_inputs_that_the_log_hardly_varied_are_no_state_that_runs_away() -> None:
+    """The log holds a belt's input near 0.1; the policy needs up to 1, one step late."""
+    mpc, rng, parts = belt_mpc(1, gain=0.5, decay=0.9), np.random.default_rng(0), []
+    for e in range(30):
+        x, before = rng.uniform(0.0, 5.0), 0.1
+        for _ in range(20):
+            u, reached = 0.1 + 0.002 * rng.normal(), 0.9 * x + 0.5 * before + 0.1
+            parts.append(([x], [u], (x - 3.0) ** 2 + 0.02 * u**2, [reached], False, e))
+            x, before = reached, u
+    log = with_memory(TransitionTable.from_arrays(*(np.array(part) for part in zip(*parts, strict=True))), mpc.layout)
+    around = place(mpc, log, [0], 30)
+    around.starts[:], around.disturbances[:] = [0.5, 0.1], 0.0
+    done = around.act(MPCPolicy(mpc))
+    assert done.actions.max() > 0.9
+    assert not done.lost.any()
+    assert done.states[0, -1, 0] == pytest.approx(3.0, abs=0.3)
+
+
+def test_starts_are_those_of_the_log() -> None:
+    assert set(initial_rows(LOG, 12, 3)) <= set(range(0, 600, 30))
+    assert len(initial_rows(LOG, 50, 0)) == 50  # more than there are episodes
+
+
+def test_what_the_log_cost_is_known_where_it_goes_on_or_ends_for_good() -> None:
+    costs, ends = np.arange(10.0), np.array([0, 0, 0, 0, 1, 0, 0, 0, 0, 0.0])
+    x = np.zeros((10, 1))
+    log = TransitionTable.from_arrays(x, x, costs, x, ends, np.repeat([0, 1], 5))
+    np.testing.assert_array_equal(returns_along(log, np.array([0, 3, 5, 8]), 3), [3.0, 7.0, 18.0, np.nan])
+
+
+def trials_of(gains: dict[str, float], votes: list[bool]) -> Trials:
+    around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 5, members=len(votes) - 1)
+    empty = Trials.none([FIRST, *gains], around, judged=np.arange(20) >= 12)
+    rng = np.random.default_rng(0)
+    common = rng.uniform(1.0, 2.0, empty.cost.shape[1:])
+    cost = np.stack([common, *(common + gain for gain in gains.values())])
+    return replace(empty, cost=cost, second=cost.copy(), votes=np.array(votes))
+
+
+def test_better_is_what_most_models_and_both_costs_say() -> None:
+    trials = trials_of({"a": -0.1, "b": 0.1}, [True, True, True])
+    assert trials.improves("a")
+    assert not trials.improves("b")
+    np.testing.assert_allclose(trials.differences("a"), -0.1)
+    trials.second[1] += 0.2
+    assert not trials.improves("a")
+
+
+def test_trials_come_back_from_arrays_and_others_are_refused() -> None:
+    trials = trials_of({"a": -0.1}, [True, False])
+    arrays = trials.to_arrays()
+    again = Trials.from_arrays(trials.names, trials.models, arrays)
+    for name, array in again.to_arrays().items():
+        np.testing.assert_array_equal(array, arrays[name])
+    with pytest.raises(FileFormatError, match="trials/cost"):
+        Trials.from_arrays((*trials.names, "b"), trials.models, arrays)
+    with pytest.raises(FileFormatError, match="trials/votes"):
+        Trials.from_arrays(trials.names, trials.models, {k: v for k, v in arrays.items() if k != "votes"})
+
+
+def test_the_best_of_some_is_chosen_and_the_worse_leave_early() -> None:
+    wrong, lazy = lq_plant.make_mpc(), TRUE_MPC.replace(horizon=1)
+    around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 30)
+    mpcs = {FIRST: wrong, "best": TRUE_MPC, "lazy": lazy}
+    trials, chosen = choose(mpcs, around)
+    assert chosen == "best"
+    assert not np.isnan(trials.of("best")).any()
+    assert np.isnan(trials.of("lazy")).any()
+    assert choose({FIRST: TRUE_MPC, "lazy": lazy}, around)[1] == FIRST
+
+
+def test_variants_of_what_is_good_are_tried_too() -> None:
+    around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 30)
+    still, half = (lq_plant.make_mpc((share * lq_plant.A, lq_plant.B)) for share in (0.1, 0.5))
+    mpcs = {FIRST: still, "half": half}
+    trials, chosen = choose(mpcs, around, lambda name, _: {f"{name}, whole": TRUE_MPC})
+    assert chosen == "half, whole"
+    assert trials.names == tuple(mpcs) == (FIRST, "half", "half, whole")
