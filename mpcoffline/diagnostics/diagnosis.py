@@ -20,10 +20,12 @@ from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
+from mpcoffline.simulation.behaviour import Behaviour
 from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
-from mpcoffline.simulation.trials import Episodes, Surroundings, Trials
+from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Trials
 
+from .differences import TODAY
 from .figure import Traces
 from .measures import (
     bound_names,
@@ -63,7 +65,7 @@ def diagnose(
     (:class:`~mpcoffline.simulation.models.LogModels`), from the same starts of the log, under what disturbed it then,
     with the user's own stage cost or one learned from the logged costs
     (:class:`~mpcoffline.simulation.logged_cost.LoggedCost`); models and starts are others than those of the choice in
-    ``fit``. That decides the verdict (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
+    ``fit``. So does a clone of the controller that made the log. That decides the verdict (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
 
     Example:
         >>> report = mpcoffline.diagnose(learner, "mpcoffline/pendulum/ddpg-v0")
@@ -110,10 +112,13 @@ def diagnose(
         n_steps=n_steps,
         seed=seed + _FRESH,
     )
-    trials, loops = _tried(policies, around)
-    first, second = loops[0], loops[-1]
+    clone = Behaviour.of(table, learned.layout, seed)
+    today = clone.replaying(clone.deviations(table, around.rows, around.n_steps))
+    trials, loops = _tried({**policies, TODAY: today}, around)
+    first, second = loops[FIRST], loops[chosen]
     lag, cost = lag_check(identified, clean), around.cost
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
+    choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(
         trials,
         chosen,
@@ -122,12 +127,14 @@ def diagnose(
         n_rows=len(table),
         cost_r2=cost.r2,
         failed=failed[1],
+        choice=choice,
         rules=tuple(rules),
     )
     reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
     report = Report(
         judgement=judgement,
         trials=trials,
+        choice=choice,
         notes=(),
         cost_r2=cost.r2,
         value=value_check(learner.value_function, clean, learned.discount),
@@ -156,10 +163,11 @@ def diagnose(
     return report.with_notes(notes_on(report, fit))
 
 
-def _tried(policies: Mapping[str, MPCPolicy], around: Surroundings) -> tuple[Trials, list[Episodes]]:
+def _tried(controllers: Mapping[str, Controller], around: Surroundings) -> tuple[Trials, dict[str, Episodes]]:
     """Closed loops of some controllers from the same starts, of which none had a part in any choice."""
-    trials = Trials.none(list(policies), around, judged=np.ones(len(around.rows), dtype=bool))
-    return trials, [trials.fill(name, around, policy, slice(0, len(around.rows))) for name, policy in policies.items()]
+    trials = Trials.none(list(controllers), around, judged=np.ones(len(around.rows), dtype=bool))
+    every = slice(0, len(around.rows))
+    return trials, {name: trials.fill(name, around, controller, every) for name, controller in controllers.items()}
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:

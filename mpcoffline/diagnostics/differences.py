@@ -104,15 +104,16 @@ class Today:
 
     @classmethod
     def of(cls, trials: Trials, name: str) -> Today:
-        """From trials; of all starts, since today's controller had no part in any choice."""
-        costs, votes = trials.of(name)[trials.votes], trials.votes
-        known = trials.returns[np.isfinite(trials.returns)]
-        ways = [paired(costs, np.broadcast_to(trials.returns, costs.shape))]
+        """From trials; of all starts of whole episodes, since today's controller had no part in any choice."""
+        votes, whole = trials.votes, whole_episodes(trials)
+        costs, returns = trials.of(name)[votes][:, whole], trials.returns[whole]
+        known = returns[np.isfinite(returns)]
+        ways = [paired(costs, np.broadcast_to(returns, costs.shape))]
         disagreement = np.full(len(costs), np.nan)
         if TODAY in trials.names:
-            clone = trials.of(TODAY)[votes]
+            clone = trials.of(TODAY)[votes][:, whole]
             ways.append(paired(costs, clone))
-            disagreement = paired(clone, np.broadcast_to(trials.returns, clone.shape))[0]
+            disagreement = paired(clone, np.broadcast_to(returns, clone.shape))[0]
         with np.errstate(invalid="ignore"):
             ends = np.array([[mean - SURE * error, mean + SURE * error] for mean, error in ways])  # (ways, 2, n)
         ends = np.where(np.isfinite(ends).all(axis=1, keepdims=True), ends, np.nan)
@@ -175,9 +176,9 @@ def candidates(trials: Trials) -> tuple[Candidate, ...]:
     """All controllers that were tried but MPC_1, the cheapest first; none where no model has a vote."""
     found = []
     for i, name in enumerate(trials.names[1:], 1):
-        d = Difference.of(trials, name, trials.names[0])
-        if len(d):
-            k, starts = d.middle, starts_of(trials, name)
+        d, starts = Difference.of(trials, name, trials.names[0]), starts_of(trials, name)
+        if len(d) and starts.any():
+            k = d.middle
             cost, _ = paired(trials.cost[i][trials.votes][:, starts], np.zeros((len(d), int(starts.sum()))))
             lost = float(trials.lost[i][trials.votes][:, starts].mean())
             levels = float(cost[k]), float(d.mean[k]), float(d.error[k])
@@ -193,6 +194,11 @@ def starts_of(trials: Trials, name: str) -> NDArray[np.bool_]:
     tried = np.asarray(~np.isnan(trials.of(name)).all(axis=0))
     fresh = trials.judged & tried
     return fresh if fresh.any() else tried
+
+
+def whole_episodes(trials: Trials) -> NDArray[np.bool_]:
+    """The starts at which episodes of the log began, which tell what one costs; all where there are hardly any."""
+    return trials.begun if trials.begun.sum() > 1 else np.ones(len(trials.rows), dtype=bool)
 
 
 def outvoted(n: int) -> int:

@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style
 from mpcoffline.simulation.trials import Trials
 
-from .differences import SURE, TODAY, Difference, candidates, outvoted
+from .differences import SURE, TODAY, Difference, candidates, outvoted, whole_episodes
 from .measures import RegionError, ValueCheck
 from .verdict import Judgement, costs_of
 
@@ -42,13 +42,19 @@ class Traces:
 
 
 def draw(
-    judgement: Judgement, trials: Trials, value: ValueCheck, fit: tuple[RegionError, ...], traces: Traces
+    judgement: Judgement,
+    trials: Trials,
+    choice: Trials,
+    value: ValueCheck,
+    fit: tuple[RegionError, ...],
+    traces: Traces,
 ) -> Figure:
     """Draws candidates, costs, models against the log, closed loops, V against returns, and the error of (FIT).
 
     Args:
         judgement: What the report says.
-        trials: The controllers that were tried.
+        trials: What was judged and what it was compared with.
+        choice: All candidates.
         value: V_phi against measured returns.
         fit: The error of (FIT) by region.
         traces: What is not in the report's text.
@@ -57,7 +63,7 @@ def draw(
         figure = new_figure(PAGE_WIDTH, _HEIGHT)
         axes = figure.subplots(3, 2)
         figure.suptitle(f"Verdict: {judgement.verdict}", fontsize=10, fontweight="bold", x=0.01, ha="left")
-        _draw_candidates(axes[0, 0], judgement, trials)
+        _draw_candidates(axes[0, 0], judgement, choice)
         _draw_costs(axes[0, 1], judgement, trials)
         _draw_agreement(axes[1, 0], judgement, trials)
         _draw_distances(axes[1, 1], traces)
@@ -119,7 +125,7 @@ def _draw_costs(axes: Axes, judgement: Judgement, trials: Trials) -> None:
 def _draw_agreement(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     """Each start: what the log cost from there, and its controller's clone on the models."""
     axes.set_title("Models against the log", loc="left")
-    known = np.isfinite(trials.returns)
+    known = np.isfinite(trials.returns) & whole_episodes(trials)
     if TODAY not in trials.names or not known.any() or not trials.votes.any():
         _say(axes, "no logged episode is as long" if not known.any() else "the logged controller\nwas not simulated")
         return

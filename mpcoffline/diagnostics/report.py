@@ -54,7 +54,8 @@ class Report:
 
     Attributes:
         judgement: The verdict and what it rests on.
-        trials: All controllers that were tried, on models of the log.
+        trials: What was judged and what it was compared with, on models of the log.
+        choice: All candidates, where the learner chose among them.
         notes: What else the user should know, and what to do about it.
         cost_r2: Share of the logged costs' variance that the simulated cost explains.
         value: V_phi against measured returns.
@@ -76,6 +77,7 @@ class Report:
 
     judgement: Judgement
     trials: Trials
+    choice: Trials | None
     notes: tuple[str, ...]
     cost_r2: float
     value: ValueCheck
@@ -159,9 +161,9 @@ class Report:
         return [title, *_columns(rows), _item(f"{voting}.")]
 
     def _candidates(self) -> list[str]:
-        """What was tried, the cheapest first."""
+        """What was tried, the cheapest first: in the choice, where there was one."""
         rows: list[tuple[str, ...]] = [("", "minus MPC_1", "models that agree", "lost")]
-        for each in candidates(self.trials):
+        for each in candidates(self.choice or self.trials):
             name = f"{each.name} (clone)" if each.name == TODAY else each.name
             chosen = f"{name} *" if each.name == self.judgement.proposal else name
             rows.append(
@@ -172,7 +174,14 @@ class Report:
                     f"{each.lost:.1%}",
                 )
             )
-        return ["Candidates (* is judged)", *_columns(rows)] if len(rows) > 1 else []
+        return (
+            [
+                f"Candidates, by {'the choice of the fit' if self.choice else 'these episodes'} (* is judged)",
+                *_columns(rows),
+            ]
+            if len(rows) > 1
+            else []
+        )
 
     def _value_text(self) -> str:
         v = self.value
@@ -182,13 +191,13 @@ class Report:
 
     def to_json(self) -> str:
         """The report as JSON text; what is not finite becomes null."""
-        fields = ("trials", "traces", "judgement")
+        fields = ("trials", "choice", "traces", "judgement")
         judgement = {name: value for name, value in vars(self.judgement).items() if name not in ("first", "today")}
         data = judgement | {name: value for name, value in vars(self).items() if name not in fields}
         data = {name: _as_data(value) for name, value in data.items()}
         t = self.trials
         data["costs"] = {name: list(cost) for name, cost in costs_of(self.judgement, t)}
-        data["candidates"] = [asdict(each) for each in candidates(t)]
+        data["candidates"] = [asdict(each) for each in candidates(self.choice or t)]
         data["difference"] = _as_data(self.judgement.first)
         data["today"] = _as_data(self.judgement.today)
         data["trials"] = {
@@ -204,7 +213,7 @@ class Report:
         Returns:
             The figure; a notebook shows it.
         """
-        return draw(self.judgement, self.trials, self.value, self.fit, self.traces)
+        return draw(self.judgement, self.trials, self.choice or self.trials, self.value, self.fit, self.traces)
 
     def figure(self, path: str | PathLike[str]) -> list[Path]:
         """Writes :meth:`plot`.

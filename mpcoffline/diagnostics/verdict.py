@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
 
-from .differences import SURE, TODAY, Difference, Today, outvoted, paired, starts_of
+from .differences import SURE, TODAY, Difference, Today, outvoted, paired, starts_of, whole_episodes
 from .measures import LagCheck
 from .withholding import DEFAULT_RULES, RULES, Evidence, gone_wrong
 
@@ -56,6 +56,7 @@ def decide(
     n_rows: int | None = None,
     cost_r2: float = 1.0,
     failed: float = 0.0,
+    choice: Trials | None = None,
     rules: tuple[str, ...] = DEFAULT_RULES,
 ) -> Judgement:
     """The verdict and why.
@@ -74,6 +75,7 @@ def decide(
         n_rows: Transitions in the data, likewise.
         cost_r2: Share of the logged costs' variance that the simulated cost explains, likewise.
         failed: Share of the proposal's problems that were not solved at first.
+        choice: The trials in which the proposal was chosen, if they are others: what else was tried.
         rules: Names of the rules of :data:`RULES` that may withhold a recommendation.
 
     Returns:
@@ -87,7 +89,7 @@ def decide(
     if not trials.votes.any():
         return Judgement("keep MPC_1", tuple(doubts), proposal, None, today, expected)
     if proposal == trials.names[0]:
-        reasons = (_nothing_better(trials), *_of_today(today, trials, proposal))
+        reasons = (_nothing_better(choice or trials), *_of_today(today, trials, proposal))
         return Judgement("keep MPC_1", reasons, proposal, Difference.of(trials, proposal, proposal), today, expected)
     first = Difference.of(trials, proposal, trials.names[0])
     told = [*_of_today(today, trials, proposal), *gone_wrong(evidence), *_failures(failed)]
@@ -128,7 +130,7 @@ def _costs(trials: Trials, name: str, first: Difference, k: int) -> Array:
 
 def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
     """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts."""
-    costs = trials.of(proposal)[trials.votes]
+    costs = trials.of(proposal)[trials.votes][:, whole_episodes(trials)]
     mean, error = paired(costs, np.zeros_like(costs))
     known = np.isfinite(mean) & np.isfinite(error)
     if not known.any():

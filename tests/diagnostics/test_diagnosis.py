@@ -25,15 +25,7 @@ WRONG = lq_plant.make_mpc((lq_plant.A, -0.5 * lq_plant.B))
 
 def fitted(mpc: MPC, table: TransitionTable = LOG) -> OfflineMPCLearner:
     value = QuadraticValue(lq_plant.BEST.P)
-    learner = OfflineMPCLearner(
-        mpc,
-        candidate="full",
-        method="bellman",
-        init="identified",
-        value_function=value,
-        fit_n_steps=1,
-        trim=1.0,
-    )
+    learner = OfflineMPCLearner(mpc, method="bellman", init="identified", value_function=value, fit_n_steps=1, trim=1.0)
     learner.fit(table, show_progress=False)
     return learner
 
@@ -47,7 +39,7 @@ def test_a_fit_that_repairs_a_wrong_model_is_recommended(good: Report) -> None:
     assert good.verdict == "recommend"
     assert good.judgement.first is not None
     assert good.judgement.first.better.all()
-    assert good.trials.of("full").mean() < 0.5 * good.trials.of("MPC_1").mean()
+    assert good.trials.of(good.judgement.proposal).mean() < 0.5 * good.trials.of("MPC_1").mean()
     assert good.prediction.identified < 1e-5 < good.prediction.nominal
     assert good.theorem.eigenvalues[0] < 1.0
     assert good.value.correlation > 0.5
@@ -62,12 +54,12 @@ def test_a_fit_that_repairs_a_wrong_model_is_recommended(good: Report) -> None:
 
 def test_text_and_json_say_the_same(good: Report) -> None:
     text, data = str(good), json.loads(good.to_json())
-    assert text.startswith("Verdict: recommend\n  - full costs ")
+    assert text.startswith(f"Verdict: recommend\n  - {good.judgement.proposal} costs ")
     assert data["verdict"] == "recommend"
-    assert data["costs"]["full"] == pytest.approx(good.judgement.expected)
+    assert data["costs"][good.judgement.proposal] == pytest.approx(good.judgement.expected)
     assert data["theorem"]["eigenvalues"] == pytest.approx(good.theorem.eigenvalues)
     assert "traces" not in data
-    assert "models predict the log" in text
+    assert "models predict the log well enough to be asked" in " ".join(text.split())
     assert all(len(line) < 100 for line in text.splitlines())
 
 
@@ -91,8 +83,8 @@ def test_where_nothing_can_be_gained_mpc_1_is_kept() -> None:
     report = diagnose(fitted(lq_plant.make_mpc((lq_plant.A, lq_plant.B))), LOG, n_starts=8, n_steps=40)
     assert report.verdict == "keep MPC_1"
     mean = report.trials.cost[:, 0].mean(axis=1)
-    assert mean[1] == pytest.approx(mean[0], rel=0.02)
-    assert "than MPC_1" in report.reasons[0]
+    assert mean[-1] == pytest.approx(mean[0], rel=0.02)
+    assert "MPC_1" in report.reasons[0]
 
 
 def test_late_inputs_are_found() -> None:
@@ -164,7 +156,7 @@ def test_a_swing_up_is_diagnosed() -> None:
     value = fit_value(part, 0.95, ValueConfig(method="expectile", n_steps=500), seed=0)
     learner = OfflineMPCLearner(mpc, preset="default", terminal="quadratic", value_function=value)
     learner.fit(part, show_progress=False)
-    report = diagnose(learner, part, n_starts=24)
+    report = diagnose(learner, part, n_starts=6)
     assert report.verdict == "recommend"
     assert report.cost_r2 > 0.99
     assert len(report.theorem.eigenvalues) == 2  # the radius is no motion of the plant

@@ -27,14 +27,15 @@ GAINS = {
 }
 
 
-def report_of(tried: Trials, name: str = "full fit") -> Report:
+def report_of(tried: Trials, name: str = "full fit", choice: Trials | None = None) -> Report:
     """Of trials; everything else is made up."""
     rng = np.random.default_rng(0)
     states = np.cumsum(rng.normal(size=(8, 51, 2)), axis=1) * np.exp(-0.1 * np.arange(51))[:, None]
     value = np.sort(rng.normal(size=(2, 100)), axis=1)
     return Report(
-        judgement=decide(tried, name),
+        judgement=decide(tried, name, choice=choice),
         trials=tried,
+        choice=choice,
         notes=("A note.",),
         cost_r2=0.998,
         value=ValueCheck(100, 0.9, -0.1, 0.05, 0.9),
@@ -68,7 +69,7 @@ def test_the_text_has_the_table_the_candidates_and_how_far_models_and_log_agree(
         "8 of 8 models predict the log well enough to be asked; on them a clone of the logged controller"
         in " ".join(text.split())
     )
-    tried = lines[lines.index("Candidates (* is judged)") + 1 :]
+    tried = lines[lines.index("Candidates, by these episodes (* is judged)") + 1 :]
     assert tried[1].split()[:3] == ["full", "fit", "*"]
     assert "7 of 8" in tried[1]
     assert tried[4].split()[:2] == ["today", "(clone)"]
@@ -91,6 +92,16 @@ def test_the_json_form_says_the_same() -> None:
     assert data["value"]["correlation"] == 0.9
     assert data["theorem"]["eigenvalues"] == [0.9, 0.5]
     assert "traces" not in data
+
+
+def test_candidates_are_those_of_the_choice() -> None:
+    found = report_of(trials({"identified": GAINS["identified + V"]}), "identified", GOOD)
+    text = str(found)
+    assert "Candidates, by the choice of the fit (* is judged)" in text
+    assert "full fit" in text
+    assert len(json.loads(found.to_json())["candidates"]) == 4
+    kept = report_of(trials({"identified": [-1.0, -2.0]}), "MPC_1", GOOD)
+    assert "the best of 3 candidates, full fit" in kept.reasons[0]
 
 
 @pytest.mark.parametrize(
