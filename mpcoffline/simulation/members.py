@@ -16,6 +16,8 @@ from mpcoffline.estimation.identification import OneStepProblem, Rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.torch_twin import TorchTwin
 
+from .invariants import Invariants
+
 _ROWS = 3_000  # on which the parameters are identified
 _LEAST_MOVE = 0.02  # of the increments' spread
 _FARTHEST = 0.3  # in scaled coordinates
@@ -31,10 +33,13 @@ class Members:
         mpc: The MPC whose model it is.
         thetas: All its parameters, one row a member, ``(m, size)``.
         residuals: Those of the last members; all have a network, of the same outputs.
+        invariants: Equations that all members are kept on.
     """
 
-    def __init__(self, mpc: MPC, thetas: Array, residuals: Sequence[Residual]) -> None:
-        self._twin, self.thetas = TorchTwin(mpc.plant_function), thetas
+    def __init__(
+        self, mpc: MPC, thetas: Array, residuals: Sequence[Residual], invariants: Invariants | None = None
+    ) -> None:
+        self._twin, self.thetas, self._invariants = TorchTwin(mpc.plant_function), thetas, invariants
         self._networks = _Networks(residuals) if residuals else None
 
     def __len__(self) -> int:
@@ -49,7 +54,7 @@ class Members:
         if self._networks is not None:
             first = len(self) - len(self._networks)
             reached[first:, :, self._networks.outputs] += self._networks(np.concatenate([x, u], axis=2)[first:])
-        return np.asarray(reached)
+        return np.asarray(reached if self._invariants is None else self._invariants.projected(reached))
 
 
 class _Networks:

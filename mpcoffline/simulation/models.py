@@ -19,6 +19,7 @@ from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layout import Layout
 
+from .invariants import Invariants
 from .members import Members, moved_parameters
 
 STEPS = 15  # that are predicted open loop to judge a model
@@ -42,6 +43,9 @@ class LogModels:
       the prediction by what the identified model misses (at least 2 % of an increment);
     * ``residual 1`` and so on: the identified model with a small network of what it misses, learned from resampled
       episodes (:func:`~mpcoffline.estimation.fit_residuals`), zero outside the data.
+
+    All are kept on the equations that the states of log and model satisfy, as that of cosine and sine
+    (:class:`~mpcoffline.simulation.invariants.Invariants`).
 
     A quarter of the episodes is held out of all fits but the identified model's: there each predicts 15 steps open
     loop, from logged states under logged inputs.
@@ -99,7 +103,9 @@ class LogModels:
         residuals = [each for each in fit_residuals(mpc, used, seed, count=n_residual) if each.network is not None]
         names = ["identified" if found is not None else "given", *(f"moved {i}" for i in range(1, len(thetas)))]
         names += [f"residual {i}" for i in range(1, len(residuals) + 1)]
-        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(residuals)]), residuals)
+        x, u, _ = problem.rows
+        kept = Invariants.of(x, u, lambda x, u: problem.model.predict(x, u, mpc.theta), seed)
+        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(residuals)]), residuals, kept)
         errors, baseline = _judged(mpc, members, rows, held_out, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
