@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -31,10 +31,17 @@ class Members:
         mpc: The MPC whose model it is.
         thetas: All its parameters, one row a member, ``(m, size)``.
         residuals: Those of the last members; all have a network, of the same outputs.
+        kept: Move successors to where states can be, one after the other.
     """
 
-    def __init__(self, mpc: MPC, thetas: Array, residuals: Sequence[Residual]) -> None:
-        self._mpc, self._residuals = mpc, residuals
+    def __init__(
+        self,
+        mpc: MPC,
+        thetas: Array,
+        residuals: Sequence[Residual],
+        kept: Sequence[Callable[[Array], Array]] = (),
+    ) -> None:
+        self._mpc, self._residuals, self._kept = mpc, residuals, kept
         self._twin, self.thetas = TorchTwin(mpc.plant_function), thetas
         self._networks = _Networks(residuals) if residuals else None
 
@@ -42,7 +49,7 @@ class Members:
         """Some of them, ``(m,)`` of truth values."""
         first = len(self) - len(self._residuals)
         residuals = [each for each, keep in zip(self._residuals, kept[first:], strict=True) if keep]
-        return Members(self._mpc, self.thetas[kept], residuals)
+        return Members(self._mpc, self.thetas[kept], residuals, self._kept)
 
     def __len__(self) -> int:
         """Number of members."""
@@ -56,6 +63,8 @@ class Members:
         if self._networks is not None:
             first = len(self) - len(self._networks)
             reached[first:, :, self._networks.outputs] += self._networks(np.concatenate([x, u], axis=2)[first:])
+        for keep in self._kept:
+            reached = keep(reached)
         return np.asarray(reached)
 
 

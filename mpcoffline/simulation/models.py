@@ -19,7 +19,9 @@ from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layout import Layout
 
+from .invariants import Invariants
 from .members import Members, moved_parameters
+from .stops import Stops
 
 STEPS = 15  # that are predicted open loop to judge a model
 VOTES = 1.5  # times the error of the best that one with a vote has at most
@@ -43,6 +45,10 @@ class LogModels:
       the prediction by what the identified model misses (at least 2 % of an increment);
     * ``residual 1`` and so on: the identified model with a small network of what it misses, learned from resampled
       episodes (:func:`~mpcoffline.estimation.fit_residuals`), zero outside the data.
+
+    All are kept on the equations that the states of log and model satisfy, as that of cosine and sine
+    (:class:`~mpcoffline.simulation.invariants.Invariants`), and within the stops that the log shows
+    (:class:`~mpcoffline.simulation.stops.Stops`).
 
     A quarter of the episodes is held out of all fits but the identified model's: there each predicts 15 steps open
     loop, from logged states under logged inputs.
@@ -94,14 +100,23 @@ class LogModels:
         """
         states, rng = excerpt(state_rows(mpc, table), _EXCERPT, seed), np.random.default_rng(seed)
         rows, held_out = plant_rows(mpc, states), HeldOut.of(states.episode_ids, seed).rows
-        used = rows.take(np.flatnonzero(~held_out))
-        problem, unwrapped = _problem(mpc, used)
+        free = np.flatnonzero(~held_out)
+        problem, unwrapped = _problem(mpc, rows.take(free))
+        x, u, reached = problem.rows
+        invariants = Invariants.of(x, u, lambda x, u: problem.model.predict(x, u, mpc.theta), seed)
+        stops = Stops.of(x, reached, problem.model.predict(x, u, mpc.theta))
+        if (stopped := stops.hit(reached)).any():  # what happens there is no model's business
+            free = free[~stopped]
+            problem = _problem(mpc, rows.take(free))[0]
+        used = rows.take(free)
         thetas = [mpc.theta, *moved_parameters(problem, used, n_perturbed, rng)]
-        residuals = fit_residuals(mpc, states.take(np.flatnonzero(~held_out)), seed, count=n_residual)
+        residuals = fit_residuals(mpc, states.take(free), seed, count=n_residual)
         networks = [each for each in residuals if each.network is not None]
         names = ["identified" if found is not None else "given", *(f"moved {i}" for i in range(1, len(thetas)))]
         names += [f"residual {i}" for i in range(1, len(networks) + 1)]
-        members = Members(mpc, np.stack([*thetas, *[mpc.theta] * len(networks)]), networks)
+        members = Members(
+            mpc, np.stack([*thetas, *[mpc.theta] * len(networks)]), networks, (invariants.projected, stops)
+        )
         errors, baseline = _judged(mpc, members, rows, held_out, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
