@@ -49,9 +49,9 @@ class Stops(NamedTuple):
         return cls(low, high)
 
     def hit(self, reached: Array) -> NDArray[np.bool_]:
-        """Whether one of the states ``(N, n)`` is at a stop, ``(N,)``: what moved it there is not what the model says."""
+        """Whether one of the states ``(N, n)`` is at a stop, ``(N,)``, where the model does not say what holds it."""
         return np.asarray(((reached <= self.low) | (reached >= self.high)).any(axis=1))
 
-    def __call__(self, x: Array) -> Array:
+    def kept(self, x: Array) -> Array:
         """States ``(..., n)`` no farther than that."""
         return np.clip(x, self.low, self.high)

@@ -18,7 +18,7 @@ def test_a_full_tank_is_a_stop_and_a_state_at_rest_is_none() -> None:
     stops = Stops.of(x, reached, predicted)
     np.testing.assert_array_equal(stops.low, [0.0, -np.inf])
     np.testing.assert_array_equal(stops.high, [10.0, np.inf])
-    np.testing.assert_array_equal(stops(np.array([[12.0, 3.0], [-1.0, -5.0]])), [[10.0, 3.0], [0.0, -5.0]])
+    np.testing.assert_array_equal(stops.kept(np.array([[12.0, 3.0], [-1.0, -5.0]])), [[10.0, 3.0], [0.0, -5.0]])
     np.testing.assert_array_equal(stops.hit(reached), (level + flow >= 10.0) | (level + flow <= 0.0))
 
 
