@@ -114,9 +114,8 @@ class LogModels:
         networks = [each for each in residuals if each.network is not None]
         names = ["identified" if found is not None else "given", *(f"moved {i}" for i in range(1, len(thetas)))]
         names += [f"residual {i}" for i in range(1, len(networks) + 1)]
-        members = Members(
-            mpc, np.stack([*thetas, *[mpc.theta] * len(networks)]), networks, (invariants.projected, stops)
-        )
+        maps = np.stack([*thetas, *[mpc.theta] * len(networks)])
+        members = Members(mpc, maps, networks, (invariants.projected, stops.kept))
         errors, baseline = _judged(mpc, members, rows, held_out, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
