@@ -15,6 +15,7 @@ from .starts import initial_rows
 from .trials import Surroundings
 
 _MOST_STEPS = 400
+_MOST_MODELS = 7
 _FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
 _HORIZONS = 2  # that an episode has at least: a log of shorter ones tells little of where a loop ends
 
@@ -53,7 +54,7 @@ def surroundings_of(
         clean = found.table
     elif not found.noise.negligible:
         clean = smooth(identified, logged, found.theta, found.noise)
-    models = LogModels.of(identified, clean, found, seed=seed).asked(_FEW_MODELS if slow else None)
+    models = LogModels.of(identified, clean, found, seed=seed).asked(_FEW_MODELS if slow else _MOST_MODELS)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)

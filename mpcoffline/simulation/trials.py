@@ -106,9 +106,18 @@ class Trials:
         return np.asarray(costs[self.names.index(name)] - costs[0])
 
     def improves(self, name: str) -> bool:
-        """Whether it costs less than MPC_1 on the median model from the starts that judge, by both regressions."""
-        gains = (self.differences(name, second=second)[self.votes][:, self.judged] for second in (False, True))
-        return all(np.median(gain.mean(axis=1)) < 0.0 for gain in gains)
+        """Whether it costs less than MPC_1 on the median model, by both regressions.
+
+        From all starts; those that had no part in the choice may not say otherwise beyond a standard error.
+        """
+        for second in (False, True):
+            gains = self.differences(name, second=second)[self.votes]
+            middle = int(np.argsort(gains.mean(axis=1), kind="stable")[len(gains) // 2])
+            fresh = gains[middle][self.judged]
+            error = fresh.std() / np.sqrt(len(fresh)) if len(fresh) else 0.0
+            if not gains[middle].mean() < 0.0 or (len(fresh) and fresh.mean() > error):
+                return False
+        return True
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The numbers; the names are not among them."""
