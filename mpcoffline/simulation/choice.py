@@ -30,9 +30,9 @@ def choose(
     """Tries MPCs on the models of the log and names the best.
 
     In rounds, each with more starts: after each, those leave that cost clearly more than the best. The best has the
-    least mean cost on the median model, of those that have a vote. It is taken if it costs less than ``"MPC_1"`` by both
-    regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`); where no model
-    has a vote, ``"MPC_1"`` stays.
+    least mean cost on the median model, of those that have a vote. It is taken if it costs less than ``"MPC_1"`` by
+    both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`); where no
+    model has a vote, ``"MPC_1"`` stays.
 
     Args:
         mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
