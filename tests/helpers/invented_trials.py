@@ -61,7 +61,6 @@ def trials(
         rows=100 * np.arange(n_starts),
         returns=returns,
         begun=np.ones(n_starts, dtype=bool),
-        begun=np.ones(n_starts, dtype=bool),
         judged=np.ones(n_starts, dtype=bool),
         n_steps=50,
     )
