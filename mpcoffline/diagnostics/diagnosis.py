@@ -61,7 +61,7 @@ def diagnose(
 ) -> Report:
     """Diagnoses a fit from the log alone.
 
-    MPC_1 and the controller that the learner hands out act on models of the log
+    MPC_1, the controller that the learner hands out and a clone of the one that made the log act on models of the log
     (:class:`~mpcoffline.simulation.models.LogModels`), from the same starts of the log, under what disturbed it then,
     with the user's own stage cost or one learned from the logged costs
     (:class:`~mpcoffline.simulation.logged_cost.LoggedCost`); models and starts are others than those of the choice in
