@@ -6,6 +6,8 @@ act (:func:`~mpcoffline.datasets.table.memory.plant_table`).
 
 from __future__ import annotations
 
+from functools import lru_cache, partial
+
 import casadi as ca
 import numpy as np
 import torch
@@ -25,16 +27,10 @@ class OneStep:
     """
 
     def __init__(self, mpc: MPC, parameters: NDArray[np.bool_]) -> None:
-        f, index, layout = mpc.plant_function, np.flatnonzero(parameters), mpc.layout
-        nx, nu = layout.n_states, len(layout.acting)
-        x, u, theta = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("theta", len(parameters))
-        reached = f(x, u, theta)
+        index, nx = np.flatnonzero(parameters), mpc.layout.n_states
         self._shapes = ((nx,), (nx, len(index)), (nx, nx))
-        parts = [reached, ca.jacobian(reached, theta)[:, index.tolist()].T, ca.jacobian(reached, x).T]
-        self._twins = [
-            TorchTwin(ca.Function("one_step", [x, u, theta], [ca.vertcat(*(ca.vec(ca.densify(y)) for y in parts[:k]))]))
-            for k in (1, 2, 3)
-        ]
+        # Made where it is needed, and once for all that look at the same model: for some, that is most of the time.
+        self._twin = partial(_twin, mpc.model.plant, len(parameters), tuple(index.tolist()))
 
     def predict(self, x: Array, u: Array, theta: Array) -> Array:
         """The prediction f_theta(x, u), ``(B, nx)``."""
@@ -53,8 +49,22 @@ class OneStep:
     def _evaluated(self, n_parts: int, x: Array, u: Array, theta: Array) -> list[Array]:
         columns = [torch.from_numpy(np.ascontiguousarray(v.T)).T for v in (x, u)]  # each entry in one piece of memory
         with torch.no_grad():
-            flat = self._twins[n_parts - 1](*columns, torch.from_numpy(theta)).numpy()
+            flat = self._twin(n_parts)(*columns, torch.from_numpy(theta)).numpy()
         shapes = self._shapes[:n_parts]
         ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
         parts = np.split(flat, ends[:-1], axis=1)
         return [part.reshape(len(x), *shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+@lru_cache(maxsize=32)
+def _twin(plant: ca.Function, size: int, index: tuple[int, ...], n_parts: int) -> TorchTwin:
+    """The first of prediction, df/dtheta and df/dx in one column; the model's parameters come first in theta."""
+    x, u, theta = ca.SX.sym("x", plant.numel_in(0)), ca.SX.sym("u", plant.numel_in(1)), ca.SX.sym("theta", size)
+    reached = plant(x, u, theta[: plant.numel_in(2)])
+    parts = [reached]
+    if n_parts > 1:
+        parts.append(ca.jacobian(reached, theta)[:, list(index)].T)
+    if n_parts > 2:
+        parts.append(ca.jacobian(reached, x).T)
+    column = ca.vertcat(*(ca.vec(ca.densify(part)) for part in parts))
+    return TorchTwin(ca.Function("one_step", [x, u, theta], [column]))

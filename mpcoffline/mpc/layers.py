@@ -8,6 +8,7 @@ often it is called.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -170,9 +171,9 @@ class _Block:
     columns: dict[int, int]
     rows: list[tuple[int, _Sum]] = field(default_factory=list)
 
-    def takes(self, terms: dict[int, float]) -> bool:
-        """Whether a sum belongs here."""
-        return 2 * sum(k in self.columns for k in terms) >= max(len(terms), len(self.columns))
+    def takes(self, terms: dict[int, float], shared: int) -> bool:
+        """Whether a sum belongs here, of whose terms so many are columns."""
+        return 2 * shared >= max(len(terms), len(self.columns))
 
     def add(self, k: int, total: _Sum) -> None:
         for source in total.terms:
@@ -215,16 +216,18 @@ def _added(nodes: list[Node], op: int, *operands: int, constant: float = 0.0) ->
 
 
 def _blocks(sums: dict[int, _Sum]) -> list[_Block]:
-    """The sums that are rows of the same matrices."""
+    """The sums that are rows of the same matrices; each is one of the latest that takes it."""
     blocks: list[_Block] = []
+    holders: dict[int, list[int]] = {}  # the blocks of which a result is a column, by result
     for k, total in sums.items():
         if len(total.terms) < _TERMS:
             continue
-        for block in reversed(blocks):
-            if block.takes(total.terms):
-                block.add(k, total)
-                break
-        else:
+        shared = Counter(i for source in total.terms for i in holders.get(source, ()))
+        found = max((i for i, count in shared.items() if blocks[i].takes(total.terms, count)), default=len(blocks))
+        if found == len(blocks):
             blocks.append(_Block(k, {}))
-            blocks[-1].add(k, total)
+        before = len(blocks[found].columns)
+        blocks[found].add(k, total)
+        for source in list(blocks[found].columns)[before:]:
+            holders.setdefault(source, []).append(found)
     return [block for block in blocks if block.pays()]

@@ -38,6 +38,7 @@ class BellmanProblem:
         self.n_states, self._ny = mpc.layout.n_states, mpc.ny
         self._value, self._discount, self.unit = value, mpc.discount, unit
         self._scale = 1.0 if cost is None else cost.scale
+        self._last: tuple[Columns, Tensor, Tensor] | None = None
 
     def discounted(self, batch: Columns) -> Tensor:
         """The weight of what follows, ``(B,)``: gamma, and zero after a terminal state."""
@@ -51,7 +52,15 @@ class BellmanProblem:
         return target
 
     def predicted(self, batch: Columns, theta: Tensor) -> Tensor:
-        """The predicted successor f_th(s,a), ``(B, ny)``; signals, which no model predicts, are those of s+."""
+        """The predicted successor f_th(s,a), ``(B, ny)``; signals, which no model predicts, are those of s+.
+
+        Two errors of one step ask for it; a large model is run, and differentiated, once.
+        """
+        if self._last is None or self._last[0] is not batch or self._last[1] is not theta:
+            self._last = batch, theta, self._predicted(batch, theta)
+        return self._last[2]
+
+    def _predicted(self, batch: Columns, theta: Tensor) -> Tensor:
         reached: Tensor = self._f(batch.observations.double(), batch.actions.double(), theta)
         n, ny = self.n_states, self._ny
         if n == ny:
