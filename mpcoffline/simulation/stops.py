@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 
 _DIGITS = 1e-6  # of a state's range: rows nearer to its end than this are on it
-_FEWEST = 5  # rows that say so
+_FEWEST = 3  # rows that say so: no two of a state that moves freely are alike
 _BEYOND = 0.01  # of the increments' spread that the model would have gone farther there, in the median
 
 
