@@ -143,7 +143,7 @@ def tried(
     known: Known,
     between: Mapping[str, MPC],
     table: TransitionTable,
-    variants: Callable[[str, MPC], Mapping[str, MPC]],
+    variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]],
     tell: Callable[[int, int, str], None],
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
@@ -153,7 +153,7 @@ def tried(
         known: What is known at the end of the fit.
         between: The MPCs between.
         table: The transitions as they were logged.
-        variants: Of a good one.
+        variants: Of good ones.
         tell: Is told how many starts of how many are done, and what is tried.
     """
     mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})

@@ -85,13 +85,12 @@ class Method(ABC):
         """
         return {}
 
-    def variants(self, known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
-        """What may be better than one of the candidates and is tried where that one is good; by default nothing.
+    def variants(self, known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
+        """What may be better than some of the candidates and is tried where these are good; by default nothing.
 
         Args:
             known: What is known at the end of the fit.
-            name: The candidate's name.
-            mpc: The candidate.
+            mpcs: The good ones, by name.
         """
         return {}
 

@@ -24,7 +24,7 @@ _VARIED = 3  # of the best, variants are tried
 def choose(
     mpcs: dict[str, MPC],
     around: Surroundings,
-    variants: Callable[[str, MPC], Mapping[str, MPC]] = lambda name, mpc: {},
+    variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]] = lambda mpcs: {},
     tell: Callable[[int, int, str], None] = lambda *what: None,
 ) -> tuple[Trials, str]:
     """Tries MPCs on the models of the log and names the best.
@@ -59,7 +59,7 @@ def choose(
         act(left, slice(begin, end))
         if begin == 0:  # what is better may be better still
             good = _still_good(trials, left, end)[:_VARIED]
-            more = {new: mpc for name in good for new, mpc in variants(name, mpcs[name]).items()}
+            more = variants({name: mpcs[name] for name in good})
             mpcs.update(more)
             policies.update({name: quick_policy(mpc) for name, mpc in more.items()})
             trials, left = trials.with_names(list(more)), [*left, *more]

@@ -162,6 +162,6 @@ def test_variants_of_what_is_good_are_tried_too() -> None:
     around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 30)
     still, half = (lq_plant.make_mpc((share * lq_plant.A, lq_plant.B)) for share in (0.1, 0.5))
     mpcs = {FIRST: still, "half": half}
-    trials, chosen = choose(mpcs, around, lambda name, _: {f"{name}, whole": TRUE_MPC})
+    trials, chosen = choose(mpcs, around, lambda good: {f"{name}, whole": TRUE_MPC for name in good})
     assert chosen == "half, whole"
     assert trials.names == tuple(mpcs) == (FIRST, "half", "half, whole")

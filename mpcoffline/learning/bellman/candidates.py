@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Mapping
 
 from mpcoffline.estimation import fit_residual, with_residual
 from mpcoffline.learning.known_cost import as_logged
@@ -17,7 +18,9 @@ _log = logging.getLogger(__name__)
 _MISSED = 0.01  # of an increment, above which a residual is looked for
 
 
-def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
+def candidates(
+    known: Known, terminal: TerminalConfig, *, fixed: bool = False, only_fitted: bool = False
+) -> dict[str, MPC]:
     """The MPCs between MPC_1 and the whole fit, by name.
 
     * ``"identified"``: the identified model, all else as given;
@@ -30,41 +33,46 @@ def candidates(known: Known, terminal: TerminalConfig) -> dict[str, MPC]:
     Args:
         known: What is known at the end of the fit.
         terminal: How the terminal cost follows from V.
+        fixed: Whether horizon or discount were asked for: then all have those of the whole fit.
+        only_fitted: Whether a stage cost was asked for that is learned.
     """
     given, full = known.given, known.mpc
     if given is None or known.found is None:
         return {}
+    if fixed:
+        given = given.replace(horizon=full.horizon, discount=full.discount)
     model = known.found.model if "model" in known.groups else full.model
     own = given.replace(model=given.model.with_delay(full.model.delay))
     if known.cost is not None:
         own = own.replace(stage_cost=full.stage_cost)  # with the logged weights, where these were taken over
     plain = own.replace(model=model)
-    found = {"identified": plain}
     farther = plain.replace(horizon=full.horizon, discount=full.discount)
-    if farther != plain and (full.horizon, full.discount) != (given.horizon, given.discount):
-        found["identified, farther"] = farther
-    if known.cost is None:
-        alike = in_units_of(farther, known.table)
-        found["fitted cost"] = in_units_of(plain, known.table).replace(model=full.model, stage_cost=full.stage_cost)
-        if terminal.method != "given" and known.value_function is not None:
-            result = None if known.result is None else dataclasses.replace(known.result, potential=None)
-            start = dataclasses.replace(known, mpc=alike, result=result)
-            found["identified, V"] = with_terminal_cost(start, terminal).mpc
-    return found
+    found = {"identified": plain, "identified, farther": farther}  # which may be the same
+    if known.cost is not None:
+        return found
+    alike = in_units_of(plain, known.table)
+    fitted = {"fitted cost": alike.replace(model=full.model, stage_cost=full.stage_cost)}
+    if only_fitted:
+        return fitted
+    if terminal.method != "given" and known.value_function is not None:
+        result = None if known.result is None else dataclasses.replace(known.result, potential=None)
+        start = dataclasses.replace(known, mpc=in_units_of(farther, known.table), result=result)
+        fitted["identified, V"] = with_terminal_cost(start, terminal).mpc
+    return found | fitted
 
 
-def with_learned_residual(known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
-    """A candidate whose model is the identified one, with a learned residual where held-out episodes ask for one.
+def with_learned_residual(known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
+    """Candidates whose model is the identified one, with a learned residual where held-out episodes ask for one.
 
     Args:
         known: What is known at the end of the fit.
-        name: The candidate's name.
-        mpc: The candidate.
+        mpcs: The candidates by name.
     """
     found, learned = known.found, "model" in known.groups and known.residual_share is None
-    if not learned or found is None or found.error_after < _MISSED or mpc.layout != known.mpc.layout:
+    if not learned or found is None or found.error_after < _MISSED:
         return {}
-    mpc = mpc.replace(model=found.model)
-    residual = fit_residual(mpc, as_logged(mpc, known.table, known.cost), known.seed)
+    alike = {name: mpc.replace(model=found.model) for name, mpc in mpcs.items() if mpc.layout == known.mpc.layout}
+    identified = known.mpc.replace(model=found.model)
+    residual = fit_residual(identified, as_logged(identified, known.table, known.cost), known.seed)
     _log.info("%s", residual)
-    return {f"{name}, residual": with_residual(mpc, residual)} if residual.taken else {}
+    return {f"{name}, residual": with_residual(mpc, residual) for name, mpc in alike.items()} if residual.taken else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -65,11 +66,12 @@ class Bellman(Method):
 
     def candidates(self, known: Known) -> dict[str, MPC]:
         """The identified model with the costs that were given, and with V; see :func:`candidates`."""
-        return candidates(known, self.terminal)
+        fixed = self.horizon is not None or self.discount is not None
+        return candidates(known, self.terminal, fixed=fixed, only_fitted=self.cost.stage_cost == "fitted")
 
-    def variants(self, known: Known, name: str, mpc: MPC) -> dict[str, MPC]:
-        """The candidate with a learned residual, where held-out episodes ask for one."""
-        return with_learned_residual(known, name, mpc)
+    def variants(self, known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
+        """Candidates with a learned residual, where held-out episodes ask for one."""
+        return with_learned_residual(known, mpcs)
 
     def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""
