@@ -1,0 +1,132 @@
+"""What a fit hands out: the best of its candidates on models of the log, MPC_1 where none is better."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import lq_plant
+import numpy as np
+import pytest
+from lq_episodes import episodes
+
+from mpcoffline import MPCPolicy, OfflineMPCLearner
+from mpcoffline.core.errors import FileFormatError, UnknownIdError
+from mpcoffline.learner.candidates import FULL
+from mpcoffline.mpc import MPC
+from mpcoffline.simulation.choice import FIRST
+
+QUICK: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "quadratic", "seed": 0}
+LOG = episodes(n=40, steps=30)
+WRONG = lq_plant.make_mpc((0.3 * lq_plant.A, lq_plant.B))
+
+
+def fitted(mpc: MPC = WRONG, **options: Any) -> OfflineMPCLearner:
+    learner = OfflineMPCLearner(mpc, **(QUICK | options))
+    learner.fit(LOG, show_progress=False)
+    return learner
+
+
+def true_cost(mpc: MPC) -> float:
+    """Of 40 steps from four states, by the plant's own matrices."""
+    policy, state, total = MPCPolicy(mpc), None, 0.0
+    x = np.array([[1.0, 0.0], [0.0, 1.0], [-0.7, 0.7], [0.5, 0.5]])
+    for _ in range(40):
+        u, state = policy.predict(x, state=state)
+        total += float(np.sum(lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)))
+        x = x @ lq_plant.A.T + u @ lq_plant.B.T
+    return total
+
+
+def test_the_best_one_is_handed_out() -> None:
+    learner = fitted()
+    found = learner.candidates
+    assert found is not None
+    assert next(iter(found)) == FIRST
+    assert {FULL, "identified"} <= set(found)
+    assert found.chosen != FIRST
+    assert learner.mpc is found.mpc is learner.policy.mpc
+    assert true_cost(learner.mpc) < 0.9 * true_cost(WRONG)
+    assert true_cost(learner.mpc) <= min(true_cost(found[FULL]), true_cost(found["identified"])) * 1.02
+    assert f"* {found.chosen}" in str(found)
+    assert learner.findings[-1].startswith(f"Handed out: {found.chosen!r}, the best of ")
+    with pytest.raises(UnknownIdError, match="identified"):
+        found["identifed"]
+
+
+def test_mpc_1_is_handed_out_where_nothing_is_better(caplog: pytest.LogCaptureFixture) -> None:
+    """It is the optimum already."""
+    exact = lq_plant.make_mpc((lq_plant.A, lq_plant.B))
+    learner = fitted(exact, horizon=2, discount=0.3)
+    assert learner.candidates is not None
+    assert learner.candidates.chosen == FIRST
+    assert learner.mpc.to_json() == exact.to_json()
+    assert "Handed out: MPC_1" in caplog.text
+    assert learner.result is not None  # of the whole fit
+    np.testing.assert_array_equal(learner.result.theta, learner.candidates[FULL].theta)
+
+
+def test_one_is_taken_by_name_and_nothing_is_tried() -> None:
+    full, named = fitted(candidate=FULL), fitted(candidate="identified")
+    assert full.candidates is None
+    assert named.candidates is not None
+    assert named.candidates.trials is None
+    assert named.mpc.stage_cost.to_json() == WRONG.stage_cost.to_json()
+    np.testing.assert_allclose(named.mpc.values["model.A"], lq_plant.A, atol=1e-3)
+    with pytest.raises(UnknownIdError, match="identified, farther"):
+        fitted(candidate="best")
+
+
+def test_the_published_recipe_never_chooses() -> None:
+    learner = OfflineMPCLearner(WRONG, preset="paper", hidden=(16,), value_n_steps=40, fit_n_steps=10, seed=0)
+    learner.fit(LOG, show_progress=False)
+    assert learner.candidates is None
+
+
+def test_what_is_asked_for_limits_the_candidates() -> None:
+    far = fitted(horizon=17).candidates
+    assert far is not None
+    assert {mpc.horizon for name, mpc in far.items() if name != FIRST} == {17}
+    fixed = fitted(learn="cost").candidates
+    assert fixed is not None
+    for mpc in fixed.values():
+        np.testing.assert_array_equal(mpc.values["model.A"], WRONG.values["model.A"])
+    learned = fitted(stage_cost="fitted").candidates
+    assert learned is not None
+    assert set(learned) == {FIRST, "fitted cost", FULL}
+
+
+def test_the_same_seed_chooses_the_same() -> None:
+    first, second = fitted().candidates, fitted().candidates
+    assert first is not None
+    assert second is not None
+    assert first.trials is not None
+    assert second.trials is not None
+    assert first.chosen == second.chosen
+    np.testing.assert_array_equal(first.trials.cost, second.trials.cost)
+
+
+def test_a_fit_that_a_callback_ends_chooses_too() -> None:
+    learner = OfflineMPCLearner(WRONG, **QUICK)
+    learner.fit(LOG, callbacks=[lambda found, *_: found.result is None], show_progress=False)
+    assert learner.candidates is not None
+    assert learner.candidates.chosen != FIRST
+
+
+def test_candidates_and_trials_come_back_from_a_file(tmp_path: Path) -> None:
+    learner = fitted()
+    learner.save(tmp_path / "l.zip")
+    again = OfflineMPCLearner.load(tmp_path / "l.zip")
+    assert str(again) == str(learner)
+    assert str(again.candidates) == str(learner.candidates)
+    np.testing.assert_array_equal(again.theta, learner.theta)
+    assert again.candidate == "auto"
+
+
+def test_a_file_whose_candidates_do_not_fit_is_refused(tmp_path: Path) -> None:
+    learner = fitted()
+    assert learner.candidates is not None
+    learner.candidates.__dict__["chosen"] = "another"
+    learner.save(tmp_path / "l.zip")
+    with pytest.raises(FileFormatError, match="candidates"):
+        OfflineMPCLearner.load(tmp_path / "l.zip")
