@@ -27,6 +27,7 @@ _FEWER_ITERATIONS = 5  # of the others, which begin where the best so far ended
 _NEAR_BOUND = 1e-2  # in scaled coordinates
 _PRIOR = 1e-8  # of the scaled coordinates: keeps them where nothing else does
 _LEAST_GAIN = 0.05  # of the one-step error
+_PROMISING = 0.99  # of the one-step error, by linear regression
 _SIGMAS = 3.0
 _WINDOW = 15  # steps of the check over many, and rows of what counts as one observation of a difference
 _FEWEST_WINDOWS = 8  # for a standard error
@@ -73,7 +74,8 @@ def find_delays(mpc: MPC, table: TransitionTable, *, seed: int = 0) -> DelaySear
     One input after the other, until nothing changes. Another dead time counts where it makes the one-step error at
     least 5 % smaller, by more than three standard errors of the difference (over stretches of 15 rows, both models on
     the same), and predictions over 15 steps no worse. The search along an input goes eight steps far, farther where
-    the errors depend on older inputs or keep falling, and never beyond a third of a typical stretch of the log.
+    the errors depend on older inputs or keep falling, and never beyond a third of a typical stretch of the log. A dead
+    time with which a regression on the linearised model explains no more is passed over.
 
     Args:
         mpc: The MPC; what its model says of dead time is what others have to beat.
@@ -155,7 +157,7 @@ class _Scan:
         d, end = 0, min(self._cap, max(_RANGE, best[i] + _PATIENCE, self._oldest(best, i) + _PATIENCE))
         while d <= end:
             candidate = (*current[:i], d, *current[i + 1 :])
-            score = self.gain(candidate, current)
+            score = self.gain(candidate, current) if self._promises(candidate, current) else 1.0
             if score < lowest:
                 chosen, lowest, end = candidate, score, min(self._cap, max(end, d + _PATIENCE))
             d += 1
@@ -163,6 +165,26 @@ class _Scan:
             return current, end
         self._z = self.errors(chosen).z
         return chosen, end
+
+    def _promises(self, delay: tuple[int, ...], than: tuple[int, ...]) -> bool:
+        """Whether identification with a dead time may pay, as the model linearised about the present parameters says.
+
+        Their best values for it are those of a linear regression, without bounds and prior: more than any model gets.
+        """
+        if delay in self._known or not len(self._z):
+            return True
+        rows = np.flatnonzero((self._before >= max(*delay, *than)) & ~self._held_out)
+        rows = rows[:: max(1, len(rows) // _FEW_ROWS)]
+        left = []
+        for each in (delay, than):
+            some = self._problem.on(Rows(self._x[rows], self._acting(each)[rows], self._reached[rows]))
+            errors, jacobian = some.linearised(self._z)
+            slopes = jacobian.reshape(errors.size, -1)
+            size = np.sqrt(np.sum(slopes**2, axis=0))
+            slopes = slopes / np.where(size > 0.0, size, 1.0)  # of a gain near zero, too, as a wrong dead time makes it
+            best = np.linalg.lstsq(slopes, errors.ravel(), rcond=1e-10)[0]
+            left.append(float(np.sum((errors.ravel() - slopes @ best) ** 2)))
+        return left[0] <= _PROMISING**2 * left[1]
 
     def gain(self, delay: tuple[int, ...], than: tuple[int, ...]) -> float:
         """The one-step error relative to that with another dead time, on held-out rows that both know."""
