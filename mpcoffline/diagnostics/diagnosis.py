@@ -77,7 +77,7 @@ def diagnose(
         learner: A fitted learner.
         dataset: What it was fitted on, or another log of the same plant.
         n_starts: Episodes simulated on each model; by default as in the choice, 64 or fewer.
-        n_steps: Their length; by default that of the longest logged one.
+        n_steps: Their length; by default that of the logged ones.
         seed: Seeds models, starts and noise.
         rules: Names of the rules that may withhold a recommendation, of ``mpcoffline.diagnostics.withholding.RULES``.
 

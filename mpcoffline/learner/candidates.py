@@ -73,7 +73,7 @@ class Candidates(Mapping[str, MPC]):
         votes = int(self.trials.votes.sum())
         if not votes:
             return "Handed out: MPC_1. No model predicts the log, so nothing could be tried."
-        where = f"of {len(self)} candidates in closed loop with {votes} models of the log"
+        where = f"of {len(self)} candidates in closed loop with {votes} model{'s' * (votes > 1)} of the log"
         if self.chosen == FIRST:
             return f"Handed out: MPC_1, the best {where}."
         gain = np.nanmean(self.trials.differences(self.chosen)[self.trials.votes], axis=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, smooth
@@ -17,7 +19,7 @@ from .trials import Surroundings
 _MOST_STEPS = 400
 _MOST_MODELS = 7
 _FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
-_HORIZONS = 2  # that an episode has at least: a log of shorter ones tells little of where a loop ends
+_LEAST_STEPS = 20  # of an episode, or a horizon
 
 
 def surroundings_of(
@@ -41,7 +43,7 @@ def surroundings_of(
         slow: Whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best models only.
         n_starts: Number of episodes on each model; 64 by default, half of them where an episode of the log began, if
             it has as many.
-        n_steps: Their length; by default that of the longest logged one, but two horizons at least and 400 at most.
+        n_steps: Their length; by default that of the logged ones that no end cut short, 400 at most.
         seed: Of models, starts and noise.
 
     Raises:
@@ -62,5 +64,12 @@ def surroundings_of(
         n_starts = min(most_starts, max(STARTS // 2, 2 * clean.n_episodes))
     rows = initial_rows(clean, n_starts, seed)
     if n_steps is None:
-        n_steps = min(most_steps, max(int(table.episodes.lengths.max()), _HORIZONS * mpc.horizon))
+        n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
     return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)
+
+
+def _usual_length(table: TransitionTable) -> int:
+    """Steps of an episode of the log that was not ended by the plant; of the longest where all were."""
+    _, firsts, lengths = table.episodes
+    whole = lengths[np.asarray(table.terminations)[firsts + lengths - 1] == 0.0]
+    return int(np.median(whole)) if len(whole) else int(lengths.max())
