@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers, check_known
@@ -20,7 +21,7 @@ from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.behaviour import Behaviour
+from mpcoffline.simulation.behaviour import Agreement, Behaviour, agreement
 from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Trials
@@ -39,7 +40,7 @@ from .measures import (
     value_check,
 )
 from .notes import Fit, notes_on
-from .report import PredictionCheck, Report
+from .report import PredictionCheck, Report, Trust
 from .stability import TheoremCheck, closed_loop_eigenvalues, leaves_reference, value_growth, weight_checks
 from .verdict import decide
 from .withholding import DEFAULT_RULES, RULES
@@ -117,6 +118,7 @@ def diagnose(
     today = clone.replaying(clone.deviations(table, around.rows, around.n_steps))
     trials, loops = _tried({**policies, TODAY: today}, around)
     first, second = loops[FIRST], loops[chosen]
+    trust = _trust(agreement(around.models, around.cost, table, today, around.rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
@@ -158,6 +160,7 @@ def diagnose(
             np.stack(returns_of(learner.value_function, clean, learned.discount)),
             reference,
         ),
+        trust=trust,
     )
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
     fit = Fit(learner.method.options.get("init") == "identified", learner.learn == "cost+model", not cost_kept)
@@ -169,6 +172,13 @@ def _tried(controllers: Mapping[str, Controller], around: Surroundings) -> tuple
     trials = Trials.none(list(controllers), around, judged=np.ones(len(around.rows), dtype=bool))
     every = slice(0, len(around.rows))
     return trials, {name: trials.fill(name, around, controller, every) for name, controller in controllers.items()}
+
+
+def _trust(found: Agreement, votes: NDArray[np.bool_]) -> Trust | None:
+    """Medians over the models that have a vote."""
+    if not votes.any():
+        return None
+    return Trust(*(float(np.median(each[votes])) for each in (found.deviations, found.scatters)))
 
 
 def _prediction(nominal: MPC, identified: MPC, learned: MPC, found: Identification) -> PredictionCheck:

@@ -47,6 +47,26 @@ class PredictionCheck:
 
 
 @dataclass(frozen=True)
+class Trust:
+    """What the log cost, as models predict it that are left to themselves under its own controller.
+
+    A clone of the logged controller acts, with what was done beside it on top; nothing is replayed that a model misses.
+
+    Attributes:
+        deviation: Median over the voting models of the mean difference of an episode's cost, simulated minus logged, in
+            spreads of the stage cost, a step.
+        scatter: Root mean square of the differences, episode by episode, likewise.
+    """
+
+    deviation: float
+    scatter: float
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"off by {self.deviation:+.2g} spreads of the cost a step, episode by episode by {self.scatter:.2g}"
+
+
+@dataclass(frozen=True)
 class Report:
     """May this fit be trusted?
 
@@ -73,6 +93,7 @@ class Report:
         n_rows: Transitions.
         n_episodes: Episodes.
         traces: What the figure shows besides; not in the JSON form.
+        trust: How well the models reproduce what the log itself cost; None where none has a vote.
     """
 
     judgement: Judgement
@@ -95,6 +116,7 @@ class Report:
     n_rows: int
     n_episodes: int
     traces: Traces = field(repr=False, compare=False)
+    trust: Trust | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -139,7 +161,7 @@ class Report:
 
     def _costs(self) -> list[str]:
         """Today, MPC_1 and the proposal, and how far models and log agree, which says how far to trust the rest."""
-        t, today = self.trials, self.judgement.today
+        t = self.trials
         rows: list[tuple[str, ...]] = [("", "lowest", "expected", "highest")]
         for name, cost in costs_of(self.judgement, t):
             known = bool(np.isfinite(cost).any())
@@ -150,14 +172,8 @@ class Report:
             )
         title = f"Cost of an episode of {t.n_steps} steps, {len(t.rows)} starts"
         voting = f"{int(t.votes.sum())} of {len(t.models)} models predict the log well enough to be asked"
-        agree = today.disagreement[np.isfinite(today.disagreement)]
-        if len(agree) and np.isfinite(today.logged_spread) and today.logged_spread > 0.0:
-            share = float(np.median(np.abs(agree))) / today.logged_spread
-            voting += (
-                f"; on them a clone of the logged controller costs {today.logged + agree.min():.4g} to"
-                f" {today.logged + agree.max():.4g}, in the log {today.logged:.4g}: they are"
-                f" {share:.2g} of the episodes' spread apart"
-            )
+        if self.trust is not None:
+            voting += f"; left to themselves under the log's own controller, their costs are {self.trust}"
         return [title, *_columns(rows), _item(f"{voting}.")]
 
     def _candidates(self) -> list[str]:

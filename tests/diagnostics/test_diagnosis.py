@@ -156,7 +156,7 @@ def test_a_swing_up_is_diagnosed() -> None:
     value = fit_value(part, 0.95, ValueConfig(method="expectile", n_steps=500), seed=0)
     learner = OfflineMPCLearner(mpc, preset="default", terminal="quadratic", value_function=value)
     learner.fit(part, show_progress=False)
-    report = diagnose(learner, part, n_starts=6)
+    report = diagnose(learner, part)
     assert report.verdict == "recommend"
     assert report.cost_r2 > 0.99
     assert len(report.theorem.eigenvalues) == 2  # the radius is no motion of the plant
