@@ -161,7 +161,7 @@ def tried(
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
     slow = are_slow(quick_policy(mpc) for mpc in (nominal, known.mpc))
     around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, seed=known.seed)
-    trials, chosen = choose(mpcs, around, variants, tell)
+    trials, chosen = choose(mpcs, around, variants, tell, FULL)
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:
         logger.warning("%s\n%s", found.finding, found)

@@ -18,6 +18,8 @@ STARTS = 64
 _SLOW = 10.0  # times as fast as ipopt
 _ROUNDS = (8, 20, 40)  # starts until the end of each; what is left judges
 _CLEAR = 2.0  # standard errors
+_TRIFLE = 0.01  # of the gain over MPC_1: what is better by less is no better
+_JUDGED = 2  # of the best at most, one after the other
 _VARIED = 3  # of the best, variants are tried
 
 
@@ -26,19 +28,21 @@ def choose(
     around: Surroundings,
     variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]] = lambda mpcs: {},
     tell: Callable[[int, int, str], None] = lambda *what: None,
+    preferred: str = "",
 ) -> tuple[Trials, str]:
     """Tries MPCs on the models of the log and names the best.
 
     In rounds, each with more starts: after each, those leave that cost clearly more than the best. The best has the
     least mean cost on the median model, of those that have a vote. It is taken if it costs less than ``"MPC_1"`` by
-    both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`); where no
-    model has a vote, ``"MPC_1"`` stays.
+    both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the
+    second best is asked; where no model has a vote, ``"MPC_1"`` stays.
 
     Args:
         mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
         around: Where they are tried; at most two thirds of its starts are used to choose.
         variants: Of the three best after the first round these are tried, too.
         tell: Is told how many starts of how many are done, and what is tried.
+        preferred: Which one is taken where it is as good as the best, but for a hundredth of the gain.
 
     Returns:
         The trials, and the name of the best.
@@ -58,22 +62,27 @@ def choose(
     for end in ends:
         act(left, slice(begin, end))
         if begin == 0:  # what is better may be better still
-            good = _still_good(trials, left, end)[:_VARIED]
+            good = _still_good(trials, left, end, preferred)[:_VARIED]
             more = variants({name: mpcs[name] for name in good})
             mpcs.update(more)
             policies.update({name: quick_policy(mpc) for name, mpc in more.items()})
             trials, left = trials.with_names(list(more)), [*left, *more]
             act(list(more), slice(0, end))
-        left, begin = [FIRST, *_still_good(trials, left, end)], end
+        left, begin = [FIRST, *_still_good(trials, left, end, preferred)], end
         if left == [FIRST]:
             break
     if left == [FIRST]:
         tell(total, total, "")
         return trials, FIRST
-    best = left[1]
-    act([FIRST, best], slice(begin, total))
+    act([FIRST], slice(begin, total))
+    chosen = FIRST
+    for name in left[1 : 1 + _JUDGED]:
+        act([name], slice(begin, total))
+        if trials.improves(name):
+            chosen = name
+            break
     tell(total, total, "")
-    return trials, best if trials.improves(best) else FIRST
+    return trials, chosen
 
 
 def are_slow(policies: Iterable[MPCPolicy]) -> bool:
@@ -91,15 +100,19 @@ def quick_policy(mpc: MPC) -> MPCPolicy:
     return MPCPolicy(mpc)
 
 
-def _still_good(trials: Trials, names: list[str], end: int) -> list[str]:
-    """Those, but MPC_1, that are not clearly worse than the best; the best first."""
+def _still_good(trials: Trials, names: list[str], end: int, preferred: str) -> list[str]:
+    """Those, but MPC_1, that are not clearly worse than the best; the best first, or the preferred one if as good."""
     differences = {name: trials.differences(name)[trials.votes][:, :end] for name in names}
     score = {name: float(np.median(each.mean(axis=1))) for name, each in differences.items()}
     best = min(names, key=lambda name: score[name])
+    trifle = _TRIFLE * abs(score[best])
 
     def near(name: str) -> bool:
         gap = differences[name] - differences[best]
         mean, error = gap.mean(axis=1), gap.std(axis=1) / np.sqrt(end)
-        return bool(np.mean(mean > _CLEAR * error) <= 0.5)
+        return bool(np.mean(mean > np.maximum(_CLEAR * error, trifle)) <= 0.5)
 
-    return sorted((name for name in names if name != FIRST and near(name)), key=lambda name: score[name])
+    def order(name: str) -> float:
+        return -np.inf if name == preferred and score[name] <= score[best] + trifle else score[name]
+
+    return sorted((name for name in names if name != FIRST and near(name)), key=order)

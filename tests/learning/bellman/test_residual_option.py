@@ -43,7 +43,7 @@ def test_a_model_that_is_right_or_not_learned_gets_none() -> None:
 
 def test_a_learner_keeps_it(tmp_path: Path) -> None:
     options = {"residual": True, "horizon": 5, "terminal": "quadratic", "value_n_steps": 20}
-    learner = OfflineMPCLearner(pendulum_mpc(), preset="default", seed=0, **options)
+    learner = OfflineMPCLearner(pendulum_mpc(), preset="default", candidate="full", seed=0, **options)
     table = pendulum_log(10, 60, 0, friction=True)
     learner.fit(table, show_progress=False)
     assert learner.result is not None
