@@ -163,7 +163,12 @@ def diagnose(
         trust=trust,
     )
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
-    fit = Fit(learner.method.options.get("init") == "identified", learner.learn == "cost+model", not cost_kept)
+    fit = Fit(
+        learner.method.options.get("init") == "identified",
+        learner.learn == "cost+model",
+        not cost_kept,
+        chosen != FIRST,
+    )
     return report.with_notes(notes_on(report, fit))
 
 

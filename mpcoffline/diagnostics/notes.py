@@ -26,16 +26,18 @@ class Fit:
         smoothed: Whether it took the noise out of the states.
         model: Whether the model was learned.
         value: Whether V entered the controller; where the given costs stay, it does not.
+        learned: Whether a learned MPC is handed out; where MPC_1 is, nothing is said of a learned one.
     """
 
     smoothed: bool
     model: bool
     value: bool
+    learned: bool = True
 
 
 def notes_on(report: Report, fit: Fit) -> tuple[str, ...]:
     """The notes on a report."""
-    return tuple(text for rule in RULES for text in rule(report, fit))
+    return tuple(text for rule in RULES if fit.learned or rule not in _OF_LEARNED for text in rule(report, fit))
 
 
 def _goal(report: Report, fit: Fit) -> Iterator[str]:
@@ -49,9 +51,9 @@ def _noise(report: Report, fit: Fit) -> Iterator[str]:
         yield f"Measurement noise of {report.noise.level:.1%}: states were smoothed here; {advice}."
 
 
-def _failures(report: Report, _: Fit) -> Iterator[str]:
+def _failures(report: Report, fit: Fit) -> Iterator[str]:
     for name, share in zip(("MPC_1", "the learned MPC"), report.failed_solves, strict=True):
-        if share > _FAILED:
+        if share > _FAILED and (fit.learned or name == "MPC_1"):
             yield (
                 f"{share:.1%} of the problems of {name} were not solved at first: has its model a corner (fmax, fabs, a"
                 " root) where it works? Smooth it, or let ipopt try these: MPCPolicy(mpc, rescue='ipopt')."
@@ -124,3 +126,4 @@ RULES: tuple[Rule, ...] = (
     _stability,
     _weights,
 )
+_OF_LEARNED = (_model, _growth, _stability, _weights)

@@ -200,11 +200,17 @@ def _nothing_better(trials: Trials) -> str:
     if not tried:
         return f"{trials.names[0]} is the only candidate."
     best = min(tried, key=lambda each: np.nan_to_num(each.mean[each.middle], nan=np.inf))
-    k = best.middle
-    sign = "less" if best.mean[k] < 0.0 else "more"
+    k, n = best.middle, int(starts_of(trials, best.name).sum())
+    gain = f"{_pair(abs(best.mean[k]), best.error[k])} {'less' if best.mean[k] < 0.0 else 'more'} an episode"
+    if best.mean[k] + SURE * best.error[k] < 0.0:  # it left before the starts that judge, or another went there
+        return (
+            f"The choice kept {trials.names[0]}. Of {len(tried)} candidates, {best.name} costs {gain} on the median"
+            f" model from {n} starts, on {int(best.better.sum())} of {len(best)} models clearly, but no other starts"
+            f" have judged it: candidate={best.name!r} hands it out, for diagnose to do so."
+        )
     return (
         f"Nothing that was learned is clearly better than {trials.names[0]}: the best of {len(tried)} candidates,"
-        f" {best.name}, costs {_pair(abs(best.mean[k]), best.error[k])} {sign} an episode on the median model."
+        f" {best.name}, costs {gain} on the median model."
     )
 
 

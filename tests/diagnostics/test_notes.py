@@ -225,3 +225,13 @@ def test_failed_solves_are_told() -> None:
     first, second = notes(failed_solves=(0.05, 0.28))
     assert first.startswith("5.0% of the problems of MPC_1")
     assert second.startswith("28.0% of the problems of the learned MPC")
+
+
+def test_where_mpc_1_is_handed_out_nothing_is_said_of_a_learned_one() -> None:
+    kept = Fit(smoothed=True, model=True, value=True, learned=False)
+    faults = {
+        "prediction": PredictionCheck(0.5, 0.1, 0.5, ()), "theorem": TheoremCheck(9.0, 0.0, (2.0,), True),
+        "failed_solves": (0.0, 0.2),
+    }  # fmt: skip
+    assert len(notes(**faults)) == 4
+    assert notes(kept, **faults) == ()

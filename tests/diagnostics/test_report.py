@@ -98,7 +98,8 @@ def test_candidates_are_those_of_the_choice() -> None:
     assert "full fit" in text
     assert len(json.loads(found.to_json())["candidates"]) == 4
     kept = report_of(trials({"identified": [-1.0, -2.0]}), "MPC_1", GOOD)
-    assert "the best of 3 candidates, full fit" in kept.reasons[0]
+    assert "The choice kept MPC_1. Of 3 candidates, full fit costs 50.2" in kept.reasons[0]
+    assert "candidate='full fit' hands it out" in kept.reasons[0]
 
 
 @pytest.mark.parametrize(
