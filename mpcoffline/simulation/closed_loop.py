@@ -83,7 +83,8 @@ def simulate(
     costs, states, actions = [], [x[0].copy()], []
     course: Plan | Course | None = None
     if policy.mpc.nx == nx > ny:  # the policy knows what was applied before, as it would in the midst of an episode
-        course = Course(*Plan.none(n * s, policy.mpc), x.reshape(-1, nx)[:, ny:])
+        unknown = Plan.none(n * s, policy.mpc)
+        course = Course(unknown.x, unknown.u, x.reshape(-1, nx)[:, ny:])
     for k in range(n_steps):
         flat = x.reshape(-1, nx)
         u, course = policy.predict(flat[:, :ny], state=course)
