@@ -115,6 +115,20 @@ static vd distances(const mpc_problem *m, const lanes *w, vd *off) {
     return overpaid;
 }
 
+/* Lanes whose plan is as near to a solution as it must be. */
+static vl is_near(const lanes *w, const vd *off, vd overpaid) {
+    vl near = vd_le(overpaid, PAID * w->size);
+    for (int j = 0; j < LIMITS; ++j) near &= vd_le(off[j], V(FEASIBLE));
+    return near;
+}
+
+/* Of two plans the one that keeps its limits, or violates them less: 1 the first, -1 the other, 0 either. */
+static int keeps_better(double violation, double other) {
+    int kept = violation <= FEASIBLE, other_kept = other <= FEASIBLE;
+    if (kept || other_kept) return kept - other_kept;
+    return violation < other ? 1 : -1;
+}
+
 /* J of the trajectory with the multipliers as they are now. */
 static void price_again(const mpc_problem *m, lanes *w, vl changed) {
     limits *c = &w->c;
@@ -143,8 +157,7 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
     vl ended = (*converged | *stalled | capped) & vd_lt(vd_abs(w->J), V(INFINITY));
     if (!vl_any(ended)) return no_lanes();
     vd overpaid = distances(m, w, off);
-    vl near = vd_le(overpaid, PAID * w->size), lost = no_lanes();
-    for (int j = 0; j < LIMITS; ++j) near &= vd_le(off[j], V(FEASIBLE));
+    vl near = is_near(w, off, overpaid), lost = no_lanes();
     vl through = ended & near & vd_le(c->tolerance, V(m->tolerance)) & ~capped;
     vl go_on = ended & ~through;
     for (int64_t k = 0; k <= m->horizon; ++k)
@@ -171,11 +184,20 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
     return lost;
 }
 
-/* What the candidates of a problem say of the sizes of its costs and limits. */
+/* What the candidates of a problem say of the sizes of its costs and limits: n of them so far. */
 typedef struct survey {
     int64_t n;
-    double J[MOST_CANDIDATES], h[LIMITS][SURVEYED * MOST_CANDIDATES], chosen[SURVEYED * MOST_CANDIDATES];
+    double *J, *h, *chosen; /* (MOST_CANDIDATES), (LIMITS, OF_EACH), (OF_EACH) */
 } survey;
+
+#define OF_EACH (SURVEYED * MOST_CANDIDATES)
+#define SURVEY_SIZE ((LIMITS + 1) * OF_EACH + MOST_CANDIDATES)
+
+static survey survey_in(double *memory) {
+    survey s;
+    s.n = 0, s.J = memory, s.chosen = memory + MOST_CANDIDATES, s.h = s.chosen + OF_EACH;
+    return s;
+}
 
 static void note(const mpc_problem *m, const lanes *w, survey *s) {
     for (int l = 0; l < LANES; ++l, ++s->n) {
@@ -184,7 +206,7 @@ static void note(const mpc_problem *m, const lanes *w, survey *s) {
             int64_t k = (i + 1) * m->horizon / SURVEYED, last = m->horizon;
             for (int j = 0; j < LIMITS; ++j) {
                 int64_t at = j >= STAGE_LIMITS ? last : j < END_FIRST && k == last ? last - 1 : !k && j >= END_FIRST ? last : k;
-                s->h[j][s->n * SURVEYED + i] = LANE(w->c.h_new[at * LIMITS + j], l);
+                s->h[j * OF_EACH + s->n * SURVEYED + i] = LANE(w->c.h_new[at * LIMITS + j], l);
             }
         }
     }
@@ -220,7 +242,10 @@ static void conclude(const mpc_problem *m, survey *s, double *first_rho, double 
     for (int j = 0; j < LIMITS; ++j) {
         n = 0;
         for (int64_t i = 0; i < s->n * SURVEYED; ++i)
-            if (s->J[i / SURVEYED] <= dearest && s->h[j][i] - s->h[j][i] == 0.0) s->chosen[n++] = s->h[j][i];
+            {
+            double h = s->h[j * OF_EACH + i];
+            if (s->J[i / SURVEYED] <= dearest && h - h == 0.0) s->chosen[n++] = h;
+        }
         scale[j] = spread(s->chosen, n, 0.25, 0.75);
         first_rho[j] = FIRST_WEIGHT * costs / (double)m->horizon / (scale[j] * scale[j]);
     }

@@ -39,6 +39,7 @@ typedef struct {
     vd tolerance, looser;                             /* of this minimisation, and times what of the first input */
     vd inner;                                         /* its iterations */
     struct survey *asked;                             /* what rollouts of candidates are noted in, or NULL */
+    vd violation;                                     /* of the hard limit that is violated most, in scales */
     int given;                                        /* whether the first input is imposed */
 } limits;
 

@@ -167,8 +167,8 @@ static int64_t store_limited(const mpc_problem *m, const mpc_batch *b, lanes *w,
     b->amount[i] = violation[lane] > 0.0 ? amount : 0.0;
     store_limits(m, b, w, lane, i);
     if (status == ITERATION_LIMIT && b->status[i] == status) { /* near enough */
-        vl near = acceptable(m, w) & vd_le(distances(m, w, off), PAID * w->size);
-        for (int j = 0; j < LIMITS; ++j) near &= vd_le(off[j], V(FEASIBLE));
+        vd overpaid = distances(m, w, off);
+        vl near = acceptable(m, w) & is_near(w, off, overpaid);
         if (near[lane]) b->status[i] = CONVERGED;
     }
     if (b->status[i] == CONVERGED && !(violation[lane] <= FEASIBLE)) b->status[i] = INFEASIBLE; /* by an imposed input */
@@ -272,20 +272,19 @@ static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, co
 /* Multipliers of zero, and weights and scales by the candidates, for a problem and for all lanes. */
 static void first_limits(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
                          int64_t n_candidates, lanes *w, double *rows) {
-    static const survey nothing;
-    survey *s = malloc(sizeof *s);
+    double *memory = malloc(SURVEY_SIZE * sizeof(double));
     double *rho = rows + (m->horizon + 1) * LIMITS, costs[MOST_CANDIDATES];
     w->c.given = b->u0 != NULL;
     for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) rows[k] = 0.0, w->c.multiplier[k] = V(0.0);
     for (int j = 0; j < LIMITS; ++j) rho[j] = rho[LIMITS + j] = rho[2 * LIMITS + j] = 1.0;
-    if (s) {
-        *s = nothing;
-        w->c.asked = s;
+    if (memory) {
+        survey s = survey_in(memory);
+        w->c.asked = &s;
         candidate_costs(m, w, b->x0 + i * NX, b->theta + i * b->theta_stride, b->u0 ? b->u0 + i * NU : NULL, candidates,
                         n_candidates, costs);
         w->c.asked = NULL;
-        conclude(m, s, rho + LIMITS, rho + 2 * LIMITS);
-        free(s);
+        conclude(m, &s, rho + LIMITS, rho + 2 * LIMITS);
+        free(memory);
     }
     for (int j = 0; j < LIMITS; ++j) {
         rho[j] = rho[LIMITS + j];
@@ -392,11 +391,9 @@ static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, cons
         iterations += starts->iterations[l];
         int converged = starts->status[l] == CONVERGED, best_converged = starts->status[best] == CONVERGED;
 #if LIMITS
-        int kept = starts->violation[l] <= FEASIBLE, best_kept = starts->violation[best] <= FEASIBLE;
-        if (kept != best_kept || !kept) {
-            if (kept > best_kept || starts->violation[l] < starts->violation[best]) best = l;
-            continue;
-        }
+        int first = keeps_better(starts->violation[l], starts->violation[best]);
+        if (first > 0) best = l;
+        if (first) continue;
 #endif
         if (goes_before(starts->J[l], converged, starts->J[best], best_converged)) best = l;
     }

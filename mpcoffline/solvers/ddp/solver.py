@@ -93,10 +93,10 @@ class DDPSolver(Solver):
     plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
     Otherwise it is the best plan found, and ``status`` says why it was not accepted: ``"iteration limit"``,
-    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), ``"infeasible"`` (a hard limit cannot
-    be kept, however much is paid for it: the plan violates it by little more than it must), or ``"not finite"``; ``words``
-    name the limit that is violated most. A hard limit that the given state violates, and no input can change, is reported
-    in ``stats["violation_now"]``, not imposed. Multipliers travel in the plan; they are forgotten where a solve failed.
+    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), ``"infeasible"`` (a hard limit
+    cannot be kept, however much is paid for it: the plan violates it by little more than it must), or ``"not finite"``;
+    ``words`` name the limit that is violated most. A hard limit that the given state violates, and no input can change,
+    is reported in ``stats["violation_now"]``, not imposed. Multipliers travel in the plan, but for those of failures.
 
     Slopes that jump or are infinite (``fmax``, ``fabs``, ``if_else``, saturations, dead zones, ``sqrt`` or ``v**0.8``
     at 0) stop a method that follows them. What is not solved because of them is solved with the corners rounded over
@@ -104,7 +104,8 @@ class DDPSolver(Solver):
     counts as solved if the rounded problem was. The first time, the log says which corners there are.
 
     References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014. Rockafellar,
-    "Augmented Lagrangians and applications of the proximal point algorithm in convex programming", doi:10.1287/moor.1.2.97.
+    "Augmented Lagrangians and applications of the proximal point algorithm in convex programming", 1976,
+    doi:10.1287/moor.1.2.97.
 
     Args:
         mpc: The problem.
@@ -177,6 +178,11 @@ class DDPSolver(Solver):
         self._n_threads = n_threads
         self._rounding: Rounding | None = None
         self._round_corners = bool(round_corners) and self._limited is None
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """What the elements of limits are called, in the order of multipliers; none where there are no limits."""
+        return self._limited.labels if self._limited is not None else ()
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
