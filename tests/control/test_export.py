@@ -98,6 +98,11 @@ def mpc_of(case: str) -> MPC:
         )
         cost = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]])
         return MPC(model, cost, QuadraticCost(np.eye(2)), 15, 0.97, [-1.0], [1.0], constraints=limits)
+    if case == "limits of stages":
+        return nominal_mpc(PENDULUM).replace(
+            constraints=Constraint(lambda x, u, p: ca.vertcat(x[2] - 2.5, -x[2] - 2.5), "speed", Penalty(20.0)),
+            horizon=25,
+        )
     if case == "network":
         network = NetworkCost.random(3, (6, 6), seed=0, scale=10.0, W=np.eye(3), x_ref=[1.0, 0.0, 0.0])
         return nominal_mpc(PENDULUM).replace(horizon=10, discount=0.95, terminal_cost=network)
@@ -123,6 +128,7 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
         "network",
         "late inputs",
         "limits",
+        "limits of stages",
         "signals",
         "signals, no bounds",
         "stiff motor",

@@ -223,6 +223,6 @@ PROBLEMS = {
     "obstacle, l1 = 50": Problem(lambda: obstacle(Penalty(50.0)), _plane_states),
     "double integrator": Problem(integrator, _line_states),
     "planar quadrotor": Problem(planar_quadrotor, _quadrotor_states),
-    "quadrotor": Problem(quadrotor_3d, _flying_states),
     "lane": Problem(lane, _lane_states),
+    "quadrotor": Problem(quadrotor_3d, _flying_states),
 }

@@ -2,17 +2,25 @@
 
 #define FIRST_TOLERANCE 1e-3 /* of the first minimisation; a tenth after each, down to the tolerance */
 #define WARM_TOLERANCE 1e-5  /* likewise, from a plan */
-#define MOST_INNER 30        /* iterations of a minimisation, before it may be of use to know the multipliers better */
+#define MOST_INNER 60        /* iterations of a minimisation, before it may be of use to know the multipliers better */
 #define FIRST_WEIGHT 1e2     /* times a spread of a stage's costs over that of h */
 #define GROWTH 5.0           /* of the weight of an element that came closer by less than */
 #define CLOSER 4.0
+#define STUCK 2.0            /* times in a row: then its square */
 #define LARGEST_WEIGHT 1e7   /* times the first: a hard limit that is not near its solution then, cannot be kept */
-#define RELAXED 10.0         /* what a weight falls by from plan to plan */
+#define RELAXED 10.0         /* what a weight falls by from plan to plan, at least, */
+#define STIFF 100.0          /* to no more than this times the first one: stiffer problems are slow */
 #define FEASIBLE 1e-6        /* scales of an element: it counts as kept */
 #define PAID 1e-7            /* of the costs' size: what is paid too much for soft ones */
 #define LEAST_SCALE 1e-2     /* of what the candidates say of an element: it is measured by no less */
 #define SURVEYED 4           /* stages of each candidate whose h say how large it is */
 #define MOST_CANDIDATES 64
+
+/* The weight to begin with, of that of the plan before and of the first one. */
+static double relaxed(double rho, double first) {
+    double less = rho / RELAXED < STIFF * first ? rho / RELAXED : STIFF * first;
+    return less > first ? less : first;
+}
 
 /* Weights that others are computed from. */
 static void weigh(limits *c) {
@@ -166,9 +174,11 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
             if (is_imposed(c, k, j)) *lambda = vd_select(go_on, pressure(c, j, *lambda, c->h[k * LIMITS + j]), *lambda);
         }
     for (int j = 0; j < LIMITS; ++j) {
-        vl slow = go_on & ~capped & vd_lt(V(FEASIBLE), off[j]) & vd_lt(c->before[j] / CLOSER, off[j]);
+        vl slow = go_on & vd_lt(V(FEASIBLE), off[j]) & vd_lt(c->before[j] / CLOSER, off[j]);
+        c->stuck[j] = vd_select(go_on, vd_select(slow, c->stuck[j] + 1.0, V(0.0)), c->stuck[j]);
+        vl often = vd_le(V(STUCK), c->stuck[j]);
         if (!(limit_l1[j] < INFINITY)) lost |= slow & vd_lt(LARGEST_WEIGHT * c->first_rho[j], c->rho[j]);
-        c->rho[j] = vd_select(slow, GROWTH * c->rho[j], c->rho[j]);
+        c->rho[j] = vd_select(slow & (often | ~capped), vd_select(often, V(GROWTH * GROWTH), V(GROWTH)) * c->rho[j], c->rho[j]);
         c->before[j] = vd_select(go_on, off[j], c->before[j]);
     }
     weigh(c);

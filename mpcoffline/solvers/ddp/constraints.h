@@ -34,7 +34,7 @@ typedef struct {
     vd *h, *h_new, *multiplier; /* (N+1, LIMITS): along the trajectory, along the one that is tried */
     vd rho[LIMITS], first_rho[LIMITS], scale[LIMITS]; /* weights; what h is measured by */
     vd inverse[LIMITS], ratio[LIMITS];                /* 1 / rho, 2 l2 / (2 l2 + rho) */
-    vd before[LIMITS];                                /* how far each was from its solution, in scales */
+    vd before[LIMITS], stuck[LIMITS];                 /* how far each was from its solution, in scales; how long so far */
     vd base, base_new, base_size, base_size_new;      /* costs without psi */
     vd tolerance, looser;                             /* of this minimisation, and times what of the first input */
     vd inner;                                         /* its iterations */

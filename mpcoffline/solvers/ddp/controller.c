@@ -53,9 +53,9 @@ static void load_limits(const mpc_problem *m, mpc_state *state, lanes *w, double
     const double *from = state->limits, *rho = from + (MPC_HORIZON + 1) * LIMITS;
     for (int i = 0; i < (MPC_HORIZON + 1) * LIMITS; ++i) w->c.multiplier[i] = from[i];
     for (int j = 0; j < LIMITS; ++j) {
-        double first = rho[LIMITS + j], relaxed = rho[j] / RELAXED;
-        w->c.rho[j] = relaxed > first ? relaxed : first;
-        w->c.first_rho[j] = first, w->c.scale[j] = rho[2 * LIMITS + j], w->c.before[j] = INFINITY;
+        double first = rho[LIMITS + j];
+        w->c.rho[j] = relaxed(rho[j], first);
+        w->c.first_rho[j] = first, w->c.scale[j] = rho[2 * LIMITS + j], w->c.before[j] = INFINITY, w->c.stuck[j] = 0.0;
     }
     w->c.tolerance = tolerance > m->tolerance ? tolerance : m->tolerance;
     w->c.looser = sqrt(w->c.tolerance / m->tolerance);

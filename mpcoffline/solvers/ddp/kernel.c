@@ -72,11 +72,11 @@ static void load_limits(const mpc_problem *m, const mpc_batch *b, lanes *w, int 
     const double *from = b->limits_guess + i * b->limits_stride, *rho = from + (m->horizon + 1) * LIMITS;
     for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) c->multiplier[k][lane] = from[k];
     for (int j = 0; j < LIMITS; ++j) {
-        double first = rho[LIMITS + j], relaxed = rho[j] / RELAXED;
-        c->rho[j][lane] = relaxed > first ? relaxed : first;
+        double first = rho[LIMITS + j];
+        c->rho[j][lane] = relaxed(rho[j], first);
         c->first_rho[j][lane] = first;
         c->scale[j][lane] = rho[2 * LIMITS + j];
-        c->before[j][lane] = INFINITY;
+        c->before[j][lane] = INFINITY, c->stuck[j][lane] = 0.0;
     }
     double tolerance = b->guess == PLAN ? WARM_TOLERANCE : FIRST_TOLERANCE;
     c->tolerance[lane] = tolerance > m->tolerance ? tolerance : m->tolerance;
@@ -154,6 +154,16 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
 }
 
 #if LIMITS
+#define HOPELESS 3.0         /* times in a row, when the iterations are used up: then it cannot be kept */
+
+/* Lanes with a hard limit that comes no closer to being kept. */
+static vl is_hopeless(const lanes *w) {
+    vl lost = no_lanes();
+    for (int j = 0; j < LIMITS; ++j)
+        if (!(limit_l1[j] < INFINITY)) lost |= vd_le(V(HOPELESS), w->c.stuck[j]);
+    return lost;
+}
+
 /* The same, with the true cost and the worst violation, and multipliers for the next plan; a solution that is only one of a
  * race is stored as it is compared. Returns the status: whatever the algorithm says, a solution keeps its limits. */
 static int64_t store_limited(const mpc_problem *m, const mpc_batch *b, lanes *w, int lane, int64_t i, int64_t status,
@@ -170,6 +180,7 @@ static int64_t store_limited(const mpc_problem *m, const mpc_batch *b, lanes *w,
         vd overpaid = distances(m, w, off);
         vl near = acceptable(m, w) & is_near(w, off, overpaid);
         if (near[lane]) b->status[i] = CONVERGED;
+        else if (violation[lane] > FEASIBLE && is_hopeless(w)[lane]) b->status[i] = INFEASIBLE;
     }
     if (b->status[i] == CONVERGED && !(violation[lane] <= FEASIBLE)) b->status[i] = INFEASIBLE; /* by an imposed input */
     return b->status[i];
