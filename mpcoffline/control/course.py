@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,19 +13,41 @@ from mpcoffline.mpc import MPC
 from mpcoffline.solvers import Plan
 
 
-class Course(NamedTuple):
+class Course(tuple[Array, ...]):
     """A plan and the inputs that were applied: the state of a policy whose MPC holds past inputs.
 
-    Attributes:
+    Args:
         x: As in :class:`~mpcoffline.solvers.Plan`.
         u: Likewise.
         memory: Inputs applied in the steps before, ``(B, n_memory)`` in the order of ``mpc.layout.names``; a row of
             NaN is one that is not known.
+        multipliers: As in :class:`~mpcoffline.solvers.Plan`: the last of four arrays, where there are any.
     """
 
-    x: Array
-    u: Array
-    memory: Array
+    __slots__ = ()
+
+    def __new__(cls, x: Array, u: Array, memory: Array, multipliers: Array | None = None) -> Self:
+        """The arrays as they are."""
+        return super().__new__(cls, (x, u, memory) if multipliers is None else (x, u, memory, multipliers))
+
+    def __getnewargs__(self) -> tuple[Array, ...]:
+        """For copies and pickles."""
+        return tuple(self)
+
+    @property
+    def x(self) -> Array:
+        """States."""
+        return self[0]
+
+    @property
+    def u(self) -> Array:
+        """Inputs."""
+        return self[1]
+
+    @property
+    def memory(self) -> Array:
+        """Past inputs."""
+        return self[2]
 
 
 def course_from(
@@ -47,10 +69,12 @@ def course_from(
     usual = np.tile(layout.filled(mpc.usual_input), (n_problems, 1)) if layout.n_memory else None
     if state is None:
         return Plan.none(n_problems, mpc), usual
-    if len(state) != (2 if usual is None else 3):
+    least = 2 if usual is None else 3
+    most = least + (mpc.constraints is not None)  # the multipliers of its limits, if the solver knows them
+    if not least <= len(state) <= most:
         what = "states and inputs" if usual is None else "states, inputs and past inputs"
         raise InvalidArgumentError("state", expected=f"what predict returned: {what}", actual=f"{len(state)} arrays")
-    plan = Plan(*state[:2])
+    plan = Plan(*state[:2], *state[least:])
     if len(plan.u) != n_problems:
         raise InvalidArgumentError(
             "state", expected=f"the state of {n_problems} environments", actual=f"that of {len(plan.u)}"

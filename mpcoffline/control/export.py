@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.outputs import check_output_folder, write_file
 from mpcoffline.core.text import c_comment, c_identifiers
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.rest import at_rest
 from mpcoffline.solvers import DDPSolver, starts
-from mpcoffline.solvers.ddp.codegen import generated, text
+from mpcoffline.solvers.ddp.codegen import algorithm, generated, text
 from mpcoffline.solvers.scaling import input_units
 
 from .policy import MPCPolicy
@@ -51,7 +51,7 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
         The files written.
 
     Raises:
-        InvalidArgumentError: For an MPC with constraints other than input bounds, or functions that C99 lacks.
+        InvalidArgumentError: For functions that C99 lacks.
         FileFormatError: If the file is damaged or foreign.
         CompilerError: If there is no working C compiler; the test vectors need one.
         StorageError: If nothing could be written there, before anything is compiled.
@@ -60,10 +60,6 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
     if not isinstance(policy, MPCPolicy):
         policy = MPCPolicy.load(policy)
     mpc = policy.mpc
-    if mpc.constraints is not None:
-        raise InvalidArgumentError(
-            "constraints", expected="none but input bounds in a policy for C", actual="constraints"
-        )
     options = policy.solver_options if policy.solver_name == "ddp" else {}
     solver = DDPSolver(mpc, **options)
     rows = _vectors(
@@ -100,8 +96,25 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
         "DT": f"{mpc.model.dt:g}",
         "BOUNDS": "\n".join(bounds),
         "FIELDS": "\n".join(fields),
+        "LIMITS": _limit_fields(solver.limit_names),
     }
     return re.sub(r"@(\w+)@", lambda match: replaced[match[1]], _HEADER)
+
+
+def _limit_fields(names: Sequence[str]) -> str:
+    """What ``mpc_state`` holds besides where there are limits."""
+    if not names:
+        return ""
+    listed = c_comment(", ".join(names))
+    along = "(MPC_HORIZON + 1) * MPC_LIMITS"
+    return f"""    /* Of the limits, with their multipliers and weights: {listed}. */
+#define MPC_LIMITS {len(names)}
+#define MPC_SURVEY {256 * (len(names) + 1) + 64}
+    int has_limits;
+    double limits[(MPC_HORIZON + 4) * MPC_LIMITS], work_limits[(MPC_HORIZON + 4) * MPC_LIMITS];
+    double work_h[{along}], work_h_new[{along}], work_multiplier[{along}];
+    double work_survey[MPC_SURVEY];
+"""
 
 
 def _source(mpc: MPC, solver: DDPSolver) -> str:
@@ -128,7 +141,7 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
         "/* mpc_parameters is nothing but MPC_NP numbers: the size of this array is negative if it were not. */",
         "typedef char mpc_parameters_are_numbers[sizeof(mpc_parameters) == MPC_NP * sizeof(double) ? 1 : -1];",
     ]
-    parts = ['#include "mpc_controller.h"', text("scalar.h"), generated(mpc), text("core.c")]
+    parts = ['#include "mpc_controller.h"', text("scalar.h"), generated(mpc), algorithm(mpc)]
     return "\n\n".join([*parts, "\n".join(constants), text("controller.c")])
 
 
@@ -265,7 +278,7 @@ typedef struct {
     double work_x[(MPC_HORIZON + 1) * MPC_NX], work_u[MPC_HORIZON * MPC_NU];
     double work_x_new[(MPC_HORIZON + 1) * MPC_NX], work_u_new[MPC_HORIZON * MPC_NU];
     double work_k[MPC_HORIZON * MPC_NU], work_K[MPC_HORIZON * MPC_NU * MPC_NX];
-} mpc_state;
+@LIMITS@} mpc_state;
 
 /* Forgets the plan and the past inputs: call it before the first step and when an episode begins. */
 void mpc_reset(mpc_state *state);

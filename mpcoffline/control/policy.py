@@ -223,7 +223,8 @@ class MPCPolicy(BasePolicy):
         answer = actions[0] if given.ndim == 1 else actions
         if memory is None:
             return answer, plan
-        return answer, Course(*plan, self.mpc.layout.remembered(memory, actions.astype(np.float64)))
+        remembered = self.mpc.layout.remembered(memory, actions.astype(np.float64))
+        return answer, Course(plan.x, plan.u, remembered, plan.multipliers)
 
     def forward(self, observation: ArrayLike | torch.Tensor, deterministic: bool = True) -> NDArray[Any] | torch.Tensor:
         """Actions ``(B, nu)`` of observations ``(B, ny)``, or of one, by cold solves: what ``policy(y)`` returns.

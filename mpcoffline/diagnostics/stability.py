@@ -102,7 +102,7 @@ def leaves_reference(policy: MPCPolicy, table: TransitionTable, reference: Array
     beside[:, own] = np.concatenate([kept, -kept]) * _APART * spread[own]
     z = reference + beside
     plan = Plan.none(len(z), mpc)
-    course: Plan | Course = Course(*plan, z[:, mpc.ny :]) if mpc.layout.n_memory else plan
+    course: Plan | Course = Course(plan.x, plan.u, z[:, mpc.ny :], plan.multipliers) if mpc.layout.n_memory else plan
     path = [z]
     for _ in range(_N_STEPS):
         u, course = policy.predict(z[:, : mpc.ny], state=course)

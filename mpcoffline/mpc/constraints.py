@@ -81,6 +81,8 @@ CONSTRAINTS: Registry[type[Any]] = Registry("constraint", AnyConstraint, ("to_js
 class Constraint(AnyConstraint):
     """h_theta(x, u) <= 0 of (MPC) at the stages 0 ... N - 1, or h_theta(x_N) <= 0.
 
+    At stage 0 the elements of a hard one that do not depend on u are not imposed: no plan can change what is given.
+
     Args:
         function: ``(x, u, p) -> h``, with ``terminal=True`` ``(x, p) -> h``: a CasADi column whose elements must not
             be positive; ``p`` holds the model's parameters. One more argument, ``(x, u, p, d)`` or ``(x, p, d)``, gets

@@ -217,7 +217,8 @@ class Surroundings:
         course: Any = None
         mpc = getattr(controller, "mpc", None)
         if mpc is not None and mpc.nx == x.shape[2] > ny:  # it knows what was applied before, as in midst of an episode
-            course = Course(*Plan.none(m * s, mpc), x.reshape(m * s, -1)[:, ny:])
+            plan = Plan.none(m * s, mpc)
+            course = Course(plan.x, plan.u, x.reshape(m * s, -1)[:, ny:], plan.multipliers)
         for k in range(self.n_steps):
             seen = x[:, :, :ny].copy()
             seen[:, :, :n] += noise[k]

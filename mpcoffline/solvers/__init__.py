@@ -41,12 +41,13 @@ def make_solver(mpc: MPC, name: str = "auto", **options: Any) -> Solver:
 
     Args:
         mpc: The problem.
-        name: ``"lqr"`` (linear model, quadratic costs, input bounds: exact), ``"ddp"`` (input bounds only; generated C,
-            hundreds of times faster than ipopt), ``"ipopt"`` (any smooth problem), any other in
-            ``mpcoffline.solvers.SOLVERS``, or ``"auto"`` for the fastest that takes the problem and has the options
-            given; its ``reason`` and the log say why not a faster one. The choice rests on the problem's structure
-            alone, not on how solves go: that depends on states that nobody knows yet, and changing over would be
-            hundreds of times slower unasked. Where ddp often fails, name ipopt, or give the policy ``rescue="ipopt"``.
+        name: ``"lqr"`` (linear model, quadratic costs, input bounds: exact), ``"ddp"`` (any smooth
+            problem of plain arithmetic; generated C, hundreds of times faster than ipopt), ``"ipopt"`` (any smooth
+            problem), any other in ``mpcoffline.solvers.SOLVERS``, or ``"auto"`` for the fastest that takes the problem
+            and has the options given; its ``reason`` and the log say why not a faster one. The choice rests on the
+            problem's structure alone, not on how solves go: that depends on states that nobody knows yet, and changing
+            over would be hundreds of times slower unasked. Where ddp often fails, name ipopt, or give the policy
+            ``rescue="ipopt"``.
         **options: Options of that solver's constructor.
 
     Returns:

@@ -148,7 +148,7 @@ class Fallback:
             return solution.u0, solution.plan.shifted()
         rows = np.flatnonzero(~solution.success)
         self.stats.n_failures += len(rows)
-        states, before = x[rows], Plan(warm_start.x[rows], warm_start.u[rows])
+        states, before = x[rows], warm_start.rows(rows)
         found = _Found(solver, states, Plan(solution.x[rows].copy(), solution.u[rows].copy()), solution.value[rows])
         reasons = np.array(solution.words)[rows]
         tried = np.broadcast_to(solution.stats.get("all_starts", False), len(x))[rows]
@@ -197,13 +197,16 @@ class Fallback:
         low, high = np.asarray(self.mpc.action_low), np.asarray(self.mpc.action_high)
         chosen = best[:, None, None]
         x, u = np.where(chosen, found.x, before.x), np.where(chosen, found.u, before.u)
-        every = Plan(solution.x.copy(), solution.u.copy())
+        y = solution.multipliers  # nothing is known of those of failures, nor of what was found instead
+        every = Plan(solution.x.copy(), solution.u.copy(), None if y is None else y.copy())
         every.x[rows], every.u[rows] = x, np.clip(u, low, high)
         inputs = every.u[:, 0].copy()
         nothing = ~Plan(x, u).known
         inputs[rows[nothing]] = np.clip(0.0, low, high)
         plan = every.shifted()
         plan.x[rows[nothing]] = plan.u[rows[nothing]] = np.nan
+        if plan.multipliers is not None:
+            plan.multipliers[rows] = np.nan
         return inputs, plan
 
 
@@ -230,7 +233,7 @@ class _Found:
     def part(self, some: NDArray[np.bool_]) -> Plan:
         """Some of the plans, those that are not usable as none."""
         plan = self.plan.select(self.usable)
-        return Plan(plan.x[some], plan.u[some])
+        return plan.rows(some)
 
     def improve(self, some: NDArray[np.bool_], solve: Callable[[NDArray[np.bool_]], Solution]) -> NDArray[np.bool_]:
         """Solves some of the problems again and takes over what is better; returns which are solved now."""

@@ -8,7 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,16 +23,43 @@ from .status import Stats, Status
 _FLOAT32 = float(np.finfo(np.float32).eps)
 
 
-class Plan(NamedTuple):
+class Plan(tuple[Array, ...]):
     """State and input trajectories, the warm start of the next solve; a row of NaN stands for "no warm start".
 
-    Attributes:
+    A tuple of two arrays; of three, where the problem has limits and the solver knows their multipliers.
+
+    Args:
         x: States, ``(B, N + 1, nx)``.
         u: Inputs, ``(B, N, nu)``.
+        multipliers: ``(B, N + 4, n)`` for n elements of limits: of the stages 0 ... N, then their weights now and at
+            first, and what they are measured by, which all are the solver's own; None or rows of NaN where nothing is
+            known of them.
     """
 
-    x: Array
-    u: Array
+    __slots__ = ()
+
+    def __new__(cls, x: Array, u: Array, multipliers: Array | None = None) -> Self:
+        """The arrays as they are."""
+        return super().__new__(cls, (x, u) if multipliers is None else (x, u, multipliers))
+
+    def __getnewargs__(self) -> tuple[Array, ...]:
+        """For copies and pickles."""
+        return tuple(self)
+
+    @property
+    def x(self) -> Array:
+        """States."""
+        return self[0]
+
+    @property
+    def u(self) -> Array:
+        """Inputs."""
+        return self[1]
+
+    @property
+    def multipliers(self) -> Array | None:
+        """Of limits, if they are known."""
+        return self[2] if len(self) > 2 else None
 
     @classmethod
     def none(cls, n_problems: int, mpc: MPC) -> Plan:
@@ -47,19 +74,27 @@ class Plan(NamedTuple):
             return np.zeros(0, dtype=bool)
         # Zero times NaN or inf is NaN: one product a row, several times faster than looking at each number.
         with np.errstate(invalid="ignore"):
-            x, u = (a.reshape(len(a), -1) @ np.zeros(a[0].size) for a in self)
+            x, u = (a.reshape(len(a), -1) @ np.zeros(a[0].size) for a in self[:2])
             return np.asarray(x + u == 0.0)
 
     def shifted(self) -> Plan:
         """The plan one step later, its last input held."""
         x = np.concatenate([self.x[:, 1:], self.x[:, -1:]], axis=1)
-        return Plan(x, np.concatenate([self.u[:, 1:], self.u[:, -1:]], axis=1))
+        y, last = self.multipliers, self.u.shape[1]
+        if y is not None:
+            y = np.concatenate([y[:, 1 : last + 1], y[:, last:]], axis=1)
+        return Plan(x, np.concatenate([self.u[:, 1:], self.u[:, -1:]], axis=1), y)
+
+    def rows(self, chosen: NDArray[Any]) -> Plan:
+        """Some of the rows."""
+        return Plan(*(array[chosen] for array in self))
 
     def select(self, keep: NDArray[np.bool_]) -> Plan:
         """The plan with the other rows forgotten."""
-        x, u = self.x.copy(), self.u.copy()
-        x[~keep], u[~keep] = np.nan, np.nan
-        return Plan(x, u)
+        arrays = [array.copy() for array in self]
+        for array in arrays:
+            array[~keep] = np.nan
+        return Plan(*arrays)
 
 
 @dataclass(frozen=True)
@@ -75,6 +110,7 @@ class Solution:
             model, bounds and constraints, and the conditions of an optimum hold. ``(B,)``
         status: How each solve ended, one a problem.
         stats: Figures of the call, as ``stats["iterations"]``.
+        multipliers: Of limits, as in :class:`Plan`: rows of NaN where a solve failed; None where there are none.
     """
 
     u0: Array
@@ -84,11 +120,14 @@ class Solution:
     success: NDArray[np.bool_]
     status: list[Status] = field(repr=False)
     stats: Stats = field(repr=False)
+    multipliers: Array | None = field(default=None, repr=False)
 
     @property
     def plan(self) -> Plan:
         """The trajectories, for the next call's ``warm_start``."""
-        return Plan(self.x, self.u) if self.x.ndim == 3 else Plan(self.x[None], self.u[None])
+        if self.x.ndim == 3:
+            return Plan(self.x, self.u, self.multipliers)
+        return Plan(self.x[None], self.u[None], None if self.multipliers is None else self.multipliers[None])
 
     @property
     def words(self) -> Sequence[str]:
@@ -98,7 +137,8 @@ class Solution:
     def unbatched(self) -> Solution:
         """The solution of the only problem, without the batch dimension."""
         stats = cast(Stats, {k: v[0] if isinstance(v, np.ndarray) else v for k, v in self.stats.items()})
-        return Solution(self.u0[0], self.x[0], self.u[0], self.value[0], self.success[0], self.status, stats)
+        y = None if self.multipliers is None else self.multipliers[0]
+        return Solution(self.u0[0], self.x[0], self.u[0], self.value[0], self.success[0], self.status, stats, y)
 
 
 class OneAtATime:

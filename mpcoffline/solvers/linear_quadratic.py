@@ -47,9 +47,19 @@ def promises_convexity(cost: StageCost | TerminalCost) -> bool:
 
 
 def is_convex(mpc: MPC) -> bool:
-    """Whether every minimum is global, for every theta: affine model, convex costs, only inputs bounded."""
+    """Whether every minimum is global, for every theta: affine model and limits, convex costs."""
     costs = promises_convexity(mpc.stage_cost) and promises_convexity(mpc.terminal_cost)
-    return mpc.constraints is None and costs and is_affine(mpc)
+    return costs and is_affine(mpc) and _has_affine_limits(mpc)
+
+
+def _has_affine_limits(mpc: MPC) -> bool:
+    """Whether h is affine in (x, u) for every theta, wherever there is one: penalties are convex and grow with it."""
+    if mpc.constraints is None:
+        return True
+    x, u, theta = _symbols(mpc)
+    along = [mpc.constraint_expression(c)(x, u, theta) for c in mpc.constraints_at("stages")]
+    end = [mpc.constraint_expression(c)(x, theta) for c in mpc.constraints_at("end")]
+    return expressions.is_affine(ca.Function("h", [x, u, theta], [ca.densify(ca.vertcat(ca.SX(0, 1), *along, *end))]))
 
 
 def _symbols(mpc: MPC) -> tuple[ca.SX, ca.SX, ca.SX]:

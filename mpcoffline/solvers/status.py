@@ -44,7 +44,9 @@ class Stats(TypedDict):
         words: What :class:`Status` says with its particulars, one text a problem, e.g. the constraint that is violated;
             left out where there are none.
         residual: Of the conditions of an optimum, relative, ``(B,)``: lqr and ipopt.
-        violation: Of the constraint that is violated most, ``(B,)``: ipopt.
+        violation: Of the constraint that is violated most, ``(B,)``: ipopt, and ddp where there are limits.
+        violation_now: By how much the given state itself violates the hard limits that no input can change at stage 0,
+            ``(B,)``, in what ddp measures each limit by: reported, not imposed.
         predicted_decrease: Of the cost by the quadratic model at the plan, ``(B,)``: ddp.
     """
 
@@ -54,4 +56,5 @@ class Stats(TypedDict):
     words: NotRequired[list[str]]
     residual: NotRequired[NDArray[np.float64]]
     violation: NotRequired[NDArray[np.float64]]
+    violation_now: NotRequired[NDArray[np.float64]]
     predicted_decrease: NotRequired[NDArray[np.float64]]

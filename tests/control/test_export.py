@@ -16,8 +16,8 @@ from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner, Signal
 from mpcoffline.control.export import export_c
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
-from mpcoffline.mpc import MPC, Model, NetworkCost, QuadraticCost
+from mpcoffline.core.errors import FileFormatError
+from mpcoffline.mpc import MPC, Constraint, Model, NetworkCost, Penalty, QuadraticCost, StateBounds
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers.ddp.build import find_compiler
 
@@ -87,6 +87,22 @@ def mpc_of(case: str) -> MPC:
         return MPC(model, cost, QuadraticCost(np.diag([0.01, 3.0]), tracks=tracks), 12, 0.95, [-high], [high])
     if case == "three inputs":
         return random_linear(0, nu=3)
+    if case == "limits":  # soft ones of each kind, and a mixed hard one that can always be kept
+        limits = [
+            StateBounds([-np.inf, -0.4], [np.inf, 0.4], "speed", Penalty(3.0)),
+            Constraint(lambda x, u, p: ca.vertcat(x[1] * u[0] - 0.2, -x[1] * u[0] - 0.2), "power"),
+            Constraint(lambda x, p: ca.vertcat(x[0] - 0.1, -x[0] - 0.1), "end", Penalty(1.0, 5.0), terminal=True),
+        ]
+        model = Model(
+            lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * ca.sin(u[0])), 2, 1, 0.2, discrete=True
+        )
+        cost = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]])
+        return MPC(model, cost, QuadraticCost(np.eye(2)), 15, 0.97, [-1.0], [1.0], constraints=limits)
+    if case == "limits of stages":
+        return nominal_mpc(PENDULUM).replace(
+            constraints=Constraint(lambda x, u, p: ca.vertcat(x[2] - 2.5, -x[2] - 2.5), "speed", Penalty(20.0)),
+            horizon=25,
+        )
     if case == "network":
         network = NetworkCost.random(3, (6, 6), seed=0, scale=10.0, W=np.eye(3), x_ref=[1.0, 0.0, 0.0])
         return nominal_mpc(PENDULUM).replace(horizon=10, discount=0.95, terminal_cost=network)
@@ -111,6 +127,8 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
         "three inputs",
         "network",
         "late inputs",
+        "limits",
+        "limits of stages",
         "signals",
         "signals, no bounds",
         "stiff motor",
@@ -257,13 +275,6 @@ def test_a_learners_file_is_taken_as_a_policys(tmp_path: Path) -> None:
         export_c(tmp_path / f"{name}.zip", tmp_path / name)
     for name in ("mpc_controller.c", "test_vectors.txt"):
         assert (tmp_path / "learner" / name).read_text() == (tmp_path / "policy" / name).read_text()
-
-
-def test_constraints_are_refused(tmp_path: Path) -> None:
-    mpc = nominal_mpc(PENDULUM).replace(constraints=lambda x, u, p: x[2] - 5.0)
-    with pytest.raises(InvalidArgumentError, match="constraints"):
-        export_c(MPCPolicy(mpc), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:

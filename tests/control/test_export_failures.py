@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hard_plants import heater, kinked, vehicle
+from limited_problems import integrator
 from numpy.typing import NDArray
 
 from mpcoffline import MPC, MPCPolicy
@@ -112,3 +113,14 @@ def test_one_sided_bounds_in_c(low: float, high: float, tmp_path: Path) -> None:
     found = in_c(policy, tmp_path, steps)
     assert (found[:, 0] == 0).all()
     np.testing.assert_allclose(found[:, 1:], expected[:, 1:], rtol=1e-6, atol=2e-6)
+
+
+def test_limits_that_cannot_be_kept(tmp_path: Path) -> None:
+    """The plan that violates them the least is applied, and the next steps are solved as if nothing had been."""
+    policy = MPCPolicy(integrator(), "ddp")
+    states = [[1.2, 0.0], [1.2, -0.3], [1.0, -3.0], [0.4, -2.6], [0.1, -0.5], [0.0, -0.3], [0.0, 0.0]]
+    steps = [(k == 0, np.array(state)) for k, state in enumerate(states)]
+    ours, theirs = in_python(policy, steps), in_c(policy, tmp_path, steps)
+    np.testing.assert_array_equal(theirs[:, 0], [0, 0, 1, 1, 0, 0, 0])
+    np.testing.assert_array_equal(ours[:, 0], theirs[:, 0])
+    np.testing.assert_allclose(ours[:, 1:], theirs[:, 1:], atol=1e-5)

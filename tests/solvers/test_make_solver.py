@@ -46,8 +46,8 @@ NONLINEAR: dict[str, Any] = {
         ({}, "lqr", "lqr is the fastest that fits"),
         ({"terminal_cost": NormCost([0.0])}, "ddp", "lqr does not support a terminal cost that is not quadratic"),
         (NONLINEAR, "ddp", "lqr does not support a model that is not affine"),
-        ({"constraints": lambda x, u, p: u - 1.0}, "ipopt", "ddp does not support constraints"),
-        ({"constraints": StateBounds([-1.0], [1.0])}, "ipopt", "lqr does not support constraints other than input"),
+        ({"constraints": lambda x, u, p: u - 1.0}, "ddp", "lqr does not support constraints other than input"),
+        ({"constraints": StateBounds([-1.0], [1.0])}, "ddp", "lqr does not support constraints other than input"),
     ],
 )
 def test_auto_takes_the_fastest_that_fits(

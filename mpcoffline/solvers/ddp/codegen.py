@@ -12,11 +12,12 @@ from mpcoffline.core import limits
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layers import layered
+from mpcoffline.solvers.limits import Limits, limits_of
 from mpcoffline.solvers.linear_quadratic import promises_convexity
 from mpcoffline.solvers.scaling import costs_of
 
 from .elimination import value_and_jacobian
-from .emission import emit
+from .emission import emit, literal
 from .layered import LayeredCode
 
 _LARGEST_BENT = 2000  # nodes of a model whose second derivatives are taken: they double the code
@@ -32,7 +33,13 @@ def source(mpc: MPC) -> str:
     Raises:
         InvalidArgumentError: If a function of the MPC cannot be expanded to SX or has no counterpart in C.
     """
-    return "\n\n".join([text("vector.h"), generated(mpc), text("core.c"), text("kernel.c")])
+    return "\n\n".join([text("vector.h"), generated(mpc), algorithm(mpc), text("kernel.c")])
+
+
+def algorithm(mpc: MPC) -> str:
+    """What iterates: ``core.c``, with what limits need around it, if there are any."""
+    names = ["core.c"] if mpc.constraints is None else ["constraints.h", "core.c", "constraints.c"]
+    return "\n\n".join(text(name) for name in names)
 
 
 def generated(mpc: MPC) -> str:
@@ -80,12 +87,17 @@ def generated(mpc: MPC) -> str:
         inputs["gen_q"].append(array)
         inputs |= {name: [read] for name, (read, _) in layers.functions.items()}
         outputs |= {name: given for name, (_, given) in layers.functions.items()}
+    kept = limits_of(mpc, x, u, theta)
+    if kept is not None:
+        for name, (read, given) in limit_functions(kept, x, u).items():
+            inputs[name], outputs[name] = read, given
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
     convex = int(as_is), int(promises_convexity(mpc.terminal_cost))
     names = {} if layers is None else _WITH_LAYERS
     parts = [
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
+        limit_constants(kept),
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
         *([] if layers is None else [text("layers.c"), *layers.maps()]),
         emit("gen_prepare", [theta], prepared),
@@ -96,6 +108,49 @@ def generated(mpc: MPC) -> str:
         *([] if layers is None else [layers.drivers(), _composed(stage_expansion=not as_is)]),
     ]
     return "\n\n".join(parts)
+
+
+def limit_functions(limits: Limits, x: ca.SX, u: ca.SX) -> dict[str, tuple[list[ca.SX], ca.SX]]:
+    """The functions that ``constraints.h`` expects: what each reads besides the parameters, and gives.
+
+    Gauss-Newton: the curvature of h is left out, so that what they add to the Hessians is positive semidefinite.
+    """
+    nx, z = x.numel(), ca.vertcat(x, u)
+    y, dy = (ca.SX.sym(name, limits.stage.numel()) for name in ("y", "dy"))
+    y_end, dy_end = (ca.SX.sym(name, limits.end.numel()) for name in ("y", "dy"))
+    slope = ca.jacobian(limits.stage, z)
+    gradient, hessian = slope.T @ y, slope.T @ ca.diag(dy) @ slope
+    end_slope = ca.jacobian(limits.end, x)
+    return {
+        "gen_h": ([x, u], _stacked(limits.stage)),
+        "gen_h_end": ([x], _stacked(limits.end)),
+        "gen_limits": (
+            [x, u, y, dy],
+            _stacked(gradient, _triangle(hessian[:nx, :nx]), hessian[nx:, :nx], hessian[nx:, nx:]),
+        ),
+        "gen_limits_end": (
+            [x, y_end, dy_end],
+            _stacked(end_slope.T @ y_end, _triangle(end_slope.T @ ca.diag(dy_end) @ end_slope)),
+        ),
+    }
+
+
+def limit_constants(limits: Limits | None) -> str:
+    """How many limits there are, and their prices."""
+    if limits is None:
+        return "#define LIMITS 0"
+    arrays = [
+        f"static const double {name}[] = {{{', '.join(map(literal, values))}}};"
+        for name, values in (("limit_l1", limits.l1), ("limit_l2", limits.l2))
+    ]
+    sizes = {
+        "LIMITS": len(limits.labels),
+        "STAGE_LIMITS": limits.stage.numel(),
+        "END_FIRST": limits.n_stage,
+    }
+    by_input = ", ".join(str(int(v)) for v in limits.by_input)
+    defined = [f"#define {name} {value}" for name, value in sizes.items()]
+    return "\n".join([*defined, *arrays, f"static const int limit_by_input[] = {{{by_input}}};"])
 
 
 def _layers(mpc: MPC, theta: ca.SX) -> LayeredCode | None:

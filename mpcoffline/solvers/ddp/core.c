@@ -22,10 +22,12 @@
  * No lane looks at another: a problem's result is the same to the bit whatever is solved next to it.
  *
  * No unit matters: costs are compared with the size of their own terms, inputs with those of the plan or their range.
+ *
+ * Where there are limits besides the bounds of inputs (LIMITS > 0), constraints.h comes before and constraints.c after.
  */
 #include <stdint.h>
 
-enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, RUNNING = -1 };
+enum { CONVERGED = 0, ITERATION_LIMIT = 1, STALLED = 2, NOT_FINITE = 3, INFEASIBLE = 4, RUNNING = -1 };
 
 #define MAX_BACKTRACKS 10
 #define MU_FIRST 1e-3 /* regularisation relative to Quu */
@@ -56,6 +58,9 @@ typedef struct {
     const double *unit;       /* (NU): sizes of the inputs against each other */
     int64_t max_iterations;
     double tolerance;         /* on the predicted decrease, relative to the sum of the magnitudes of the costs */
+#if LIMITS
+    int race; /* whether multipliers stay as they are */
+#endif
 } mpc_problem;
 
 typedef struct {
@@ -69,34 +74,73 @@ typedef struct {
     vd alpha, stretch;         /* length of the last step, 0 at first; the one that two steps in a row suggest */
     vl settled; /* lanes whose first input has settled */
     vl pd; /* lanes whose backward pass found a positive definite Quu */
+#if LIMITS
+    limits c;
+#endif
 } lanes;
+
+#if LIMITS
+#define TOLERANCE_OF(m, w) (w)->c.tolerance
+#define LOOSER(w) (w)->c.looser
+static void press_stage(const limits *c, int64_t k, const vd *x, const vd *u, const vd *p, vd *out);
+static void press_end(const limits *c, int64_t N, const vd *x, const vd *p, vd *out);
+static void look(const mpc_problem *m, lanes *w);
+#else
+#define TOLERANCE_OF(m, w) (m)->tolerance
+#define LOOSER(w) 1.0
+#endif
 
 static inline vl all_lanes(void) { return vd_le(V(0.0), V(0.0)); }
 static inline vl no_lanes(void) { return vd_lt(V(0.0), V(0.0)); }
 
 static inline vd clip(vd a, vd low, vd high) { return vd_min(vd_max(a, low), high); }
 
+#if LIMITS
+/* The end of a rollout: keeps the cost J and its size as they are without the limits, and returns J with them. */
+static vd add_prices(const mpc_problem *m, lanes *w, double weight, const vd *x, vd prices, vd price_size, vd J, vd *size) {
+    vd price = weight * end_prices(&w->c, m->horizon, x + m->horizon * NX, w->p, w->c.h_new);
+    w->c.base_new = J, w->c.base_size_new = *size;
+    *size += price_size + vd_abs(price);
+    return J + (prices + price);
+}
+#endif
+
 /* x+ and J along (x, u) -> open-loop states from s; returns the cost, and sets its size. */
-static vd rollout_open(const mpc_problem *m, const lanes *w, vd *x, const vd *u, vd *size) {
+static vd rollout_open(const mpc_problem *m, lanes *w, vd *x, const vd *u, vd *size) {
     vd J = V(0.0), out[NX + 1];
     *size = V(0.0);
     double weight = 1.0;
+#if LIMITS
+    vd prices = V(0.0), price_size = V(0.0);
+#endif
     for (int i = 0; i < NX; ++i) x[i] = w->s[i];
     for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
         gen_step(x + k * NX, u + k * NU, w->p, out);
         for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
         J += weight * out[NX];
         *size += weight * vd_abs(out[NX]);
+#if LIMITS
+        vd price = stage_prices(&w->c, k, x + k * NX, u + k * NU, w->p, w->c.h_new);
+        prices += weight * price, price_size += weight * vd_abs(price);
+#endif
     }
     gen_final(x + m->horizon * NX, w->p, out);
     *size += weight * vd_abs(out[0]);
+#if LIMITS
+    J += weight * out[0];
+    return add_prices(m, w, weight, x, prices, price_size, J, size);
+#else
     return J + weight * out[0];
+#endif
 }
 
 /* The closed-loop rollout of a step of length alpha (per lane) into x_new, u_new; sets J_new, size_new. */
 static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
     vd J = V(0.0), size = V(0.0), out[NX + 1], *x = w->x_new;
     double weight = 1.0;
+#if LIMITS
+    vd prices = V(0.0), price_size = V(0.0);
+#endif
     for (int i = 0; i < NX; ++i) x[i] = w->s[i];
     for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
         const vd *K = w->K + k * NU * NX;
@@ -112,10 +156,17 @@ static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
         for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
         J += weight * out[NX];
         size += weight * vd_abs(out[NX]);
+#if LIMITS
+        vd price = stage_prices(&w->c, k, x + k * NX, u, w->p, w->c.h_new);
+        prices += weight * price, price_size += weight * vd_abs(price);
+#endif
     }
     gen_final(x + m->horizon * NX, w->p, out);
     w->J_new = J + weight * out[0];
     w->size_new = size + weight * vd_abs(out[0]);
+#if LIMITS
+    w->J_new = add_prices(m, w, weight, x, prices, price_size, w->J_new, &w->size_new);
+#endif
 }
 
 /* H = L D L' of a matrix, in place: 1/D on the diagonal, L below it. Clears lanes that are not positive definite. */
@@ -315,6 +366,10 @@ static void backward(const mpc_problem *m, lanes *w) {
     vd Vx[NX], Vxx[NT], out[NX + NX + NU + NT + NU * NX + NU * NU];
     int64_t N = m->horizon;
     expand_final(w->x + N * NX, w->p, out);
+#if LIMITS
+    if (vl_any(~vd_lt(w->J, V(INFINITY)))) look(m, w);
+    press_end(&w->c, N, w->x + N * NX, w->p, out);
+#endif
     for (int i = 0; i < NX; ++i) Vx[i] = out[i];
     for (int i = 0; i < NT; ++i) Vxx[i] = out[NX + i];
     double weight = 1.0;
@@ -332,6 +387,9 @@ static void backward(const mpc_problem *m, lanes *w) {
     for (int64_t k = N - 1; k >= 0; --k, weight /= m->discount) {
         const vd *u = w->u + k * NU;
         expand_stage(w->x + k * NX, u, w->x + (k + 1) * NX, Vx, Vxx, &discount, w->p, out);
+#if LIMITS
+        press_stage(&w->c, k, w->x + k * NX, u, w->p, out + NX);
+#endif
         const vd *Qx = out + NX, *Qu = Qx + NX, *Qxx = Qu + NU, *Qux = Qxx + NT, *Quu = Qux + NU * NX;
         for (int i = 0; i < NX && guessed; ++i) defect += weight * m->discount * vd_abs(Vx[i] * out[i]);
         /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. An
@@ -431,15 +489,26 @@ static inline int goes_before(double J, int converged, double best, int best_con
 static void accept(const mpc_problem *m, lanes *w, vl mask) {
     w->J = vd_select(mask, w->J_new, w->J);
     w->size = vd_select(mask, w->size_new, w->size);
+#if LIMITS
+    w->c.base = vd_select(mask, w->c.base_new, w->c.base);
+    w->c.base_size = vd_select(mask, w->c.base_size_new, w->c.base_size);
+#endif
     if (!vl_any(~mask)) {
         vd *x = w->x, *u = w->u;
         w->x = w->x_new, w->u = w->u_new;
         w->x_new = x, w->u_new = u;
+#if LIMITS
+        vd *h = w->c.h;
+        w->c.h = w->c.h_new, w->c.h_new = h;
+#endif
         return;
     }
     if (!vl_any(mask)) return;
     for (int64_t k = 0; k < m->horizon * NU; ++k) w->u[k] = vd_select(mask, w->u_new[k], w->u[k]);
     for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(mask, w->x_new[k], w->x[k]);
+#if LIMITS
+    for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) w->c.h[k] = vd_select(mask, w->c.h_new[k], w->c.h[k]);
+#endif
 }
 
 /* Lanes that Gauss-Newton, where it creeps, has brought near enough to a solution. */
@@ -457,7 +526,7 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
     for (int a = 0; a < NU; ++a) {
         double range = m->high[a] - m->low[a], least = range < INFINITY ? LEAST_INPUT * range : 0.0;
         vd size = clip(w->largest[a], V(least), V(range));
-        settled &= vd_le(far * vd_abs(w->k[a]), INPUT_TOLERANCE * size);
+        settled &= vd_le(far * vd_abs(w->k[a]), LOOSER(w) * INPUT_TOLERANCE * size);
     }
     vl at_rest = vd_le(w->size, w->hidden); /* nothing but rounding is left of the cost */
     settled |= at_rest;
@@ -466,7 +535,7 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
     w->settled = settled;
     /* A point is a solution when the model holds and the quadratic model promises no further decrease. */
     vl small = settled & vd_lt(vd_abs(w->J), V(INFINITY)) &
-               (vd_le(w->predicted, m->tolerance * w->size) | at_rest);
+               (vd_le(w->predicted, TOLERANCE_OF(m, w) * w->size) | at_rest);
     vl open = all_lanes();
     vd alpha = vd_select(vd_le(w->mu, V(0.0)) & ~small, w->stretch, V(1.0));
     w->alpha = V(0.0);
@@ -483,8 +552,8 @@ static void iterate(const mpc_problem *m, lanes *w, vl wanted, vl *converged, vl
         alpha = vd_select(vd_lt(V(1.0), alpha), V(1.0), 0.4 * alpha);
     }
     /* A warm start that obeys the model is as good as a rollout, only its cost is not known before the step. */
-    vl nearly = vd_le(w->defect, DEFECT_TOLERANCE * m->tolerance * w->size) &
-                vd_le(w->predicted, m->tolerance * w->size);
+    vl nearly = vd_le(w->defect, DEFECT_TOLERANCE * TOLERANCE_OF(m, w) * w->size) &
+                vd_le(w->predicted, TOLERANCE_OF(m, w) * w->size);
     *converged = small | (nearly & *moved & settled);
     vd less = vd_select(vd_lt(V(MU_MIN), 0.2 * w->mu), 0.2 * w->mu, V(0.0));
     vd more = vd_select(vd_lt(V(0.0), w->mu), 8.0 * w->mu, V(MU_FIRST));

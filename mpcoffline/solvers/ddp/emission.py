@@ -62,7 +62,7 @@ def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> 
     pointers = [f"i{k}" for k in range(len(inputs))]
     arguments = "".join(f"const vd *{pointer}, " for pointer in pointers) + "vd *out"
     if len(program) <= _LONGEST:
-        return _function(name, arguments, _statements(name, program, len(program)), pointers, attribute)
+        return _function(name, arguments, _statements(name, program, len(program)), [*pointers, "out"], attribute)
     work, pieces, calls = f"vd w[{function.sz_w()}];", [], []
     statements = _statements(name, program, _PIECE)
     for k, start in enumerate(range(0, len(program), _PIECE)):

@@ -5,6 +5,9 @@
 static void lanes_free(lanes *w) {
     if (!w) return;
     free(w->x); free(w->u); free(w->x_new); free(w->u_new); free(w->k); free(w->K);
+#if LIMITS
+    free(w->c.h); free(w->c.h_new); free(w->c.multiplier);
+#endif
     free(w);
 }
 
@@ -12,9 +15,17 @@ static lanes *lanes_new(int64_t N) {
     lanes *w = NULL;
     if (posix_memalign((void **)&w, 64, sizeof(lanes))) return NULL;
     memset(w, 0, sizeof(lanes));
-    size_t sizes[6] = {(N + 1) * NX, N * NU, (N + 1) * NX, N * NU, N * NU, N * NU * NX};
-    vd **fields[6] = {&w->x, &w->u, &w->x_new, &w->u_new, &w->k, &w->K};
-    for (int i = 0; i < 6; ++i) {
+#if LIMITS
+    enum { FIELDS = 9 };
+    size_t along = (N + 1) * LIMITS, sizes[] = {(N + 1) * NX, N * NU, (N + 1) * NX, N * NU, N * NU, N * NU * NX,
+                                                along, along, along};
+    vd **fields[] = {&w->x, &w->u, &w->x_new, &w->u_new, &w->k, &w->K, &w->c.h, &w->c.h_new, &w->c.multiplier};
+#else
+    enum { FIELDS = 6 };
+    size_t sizes[] = {(N + 1) * NX, N * NU, (N + 1) * NX, N * NU, N * NU, N * NU * NX};
+    vd **fields[] = {&w->x, &w->u, &w->x_new, &w->u_new, &w->k, &w->K};
+#endif
+    for (int i = 0; i < FIELDS; ++i) {
         void *memory;
         if (posix_memalign(&memory, 64, sizes[i] * sizeof(vd))) {
             lanes_free(w);
@@ -39,6 +50,14 @@ typedef struct {
     int guess;                       /* PLAN, INPUTS, or ROLLOUT */
     const double *x_guess, *u_guess; /* as x, u, and may be these */
     int rivals;                      /* these are starts of one problem, of which only the best solution matters */
+#if LIMITS
+    const double *limits_guess;     /* (n, N+4, LIMITS), or one for all: see MULTIPLIER_ROWS */
+    int64_t limits_stride;          /* (N+4) LIMITS, or 0 */
+    double *limits;                 /* (n, N+4, LIMITS) */
+    double *violation, *now;        /* (n): as appraise says */
+    int64_t *worst;                 /* (n) */
+    double *amount;                 /* (n): of the worst, in its own unit */
+#endif
 } mpc_batch;
 
 /* One theta for all lanes. */
@@ -46,6 +65,40 @@ static void load_theta(lanes *w, const double *theta) {
     for (int j = 0; j < NP; ++j) w->p[j] = V(theta[j]);
     gen_prepare(w->p, w->p + NP);
 }
+
+#if LIMITS
+static void load_limits(const mpc_problem *m, const mpc_batch *b, lanes *w, int lane, int64_t i) {
+    limits *c = &w->c;
+    const double *from = b->limits_guess + i * b->limits_stride, *rho = from + (m->horizon + 1) * LIMITS;
+    for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) c->multiplier[k][lane] = from[k];
+    for (int j = 0; j < LIMITS; ++j) {
+        double first = rho[LIMITS + j];
+        c->rho[j][lane] = relaxed(rho[j], first);
+        c->first_rho[j][lane] = first;
+        c->scale[j][lane] = rho[2 * LIMITS + j];
+        c->before[j][lane] = INFINITY, c->stuck[j][lane] = 0.0;
+    }
+    double tolerance = b->guess == PLAN ? WARM_TOLERANCE : FIRST_TOLERANCE;
+    c->tolerance[lane] = tolerance > m->tolerance ? tolerance : m->tolerance;
+    c->looser[lane] = sqrt(c->tolerance[lane] / m->tolerance);
+    c->inner[lane] = 0.0;
+    c->given = b->u0 != NULL;
+    weigh(c);
+}
+
+static void store_limits(const mpc_problem *m, const mpc_batch *b, const lanes *w, int lane, int64_t i) {
+    const limits *c = &w->c;
+    int64_t N = m->horizon;
+    double *to = b->limits + i * MULTIPLIER_ROWS(N) * LIMITS, *rho = to + (N + 1) * LIMITS;
+    for (int64_t k = 0; k < (N + 1) * LIMITS; ++k) to[k] = c->multiplier[k][lane];
+    for (int j = 0; j < END_FIRST; ++j) to[N * LIMITS + j] = c->multiplier[(N - 1) * LIMITS + j][lane]; /* to be held */
+    for (int j = 0; j < LIMITS; ++j) {
+        rho[j] = c->rho[j][lane];
+        rho[LIMITS + j] = c->first_rho[j][lane];
+        rho[2 * LIMITS + j] = c->scale[j][lane];
+    }
+}
+#endif
 
 static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int lane, int64_t i) {
     int64_t N = m->horizon;
@@ -69,6 +122,9 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
     w->J[lane] = b->guess == ROLLOUT ? b->J[i] : INFINITY;
     w->size[lane] = b->guess == ROLLOUT ? b->size[i] : INFINITY;
     w->mu[lane] = w->alpha[lane] = 0.0;
+#if LIMITS
+    load_limits(m, b, w, lane, i);
+#endif
 }
 
 /* Whether no number has the exponent of infinities and NaNs; in integers, which compilers vectorise. */
@@ -96,6 +152,40 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
     b->status[i] = finite ? status : NOT_FINITE;
     b->iterations[i] = iterations;
 }
+
+#if LIMITS
+#define HOPELESS 3.0         /* times in a row, when the iterations are used up: then it cannot be kept */
+
+/* Lanes with a hard limit that comes no closer to being kept. */
+static vl is_hopeless(const lanes *w) {
+    vl lost = no_lanes();
+    for (int j = 0; j < LIMITS; ++j)
+        if (!(limit_l1[j] < INFINITY)) lost |= vd_le(V(HOPELESS), w->c.stuck[j]);
+    return lost;
+}
+
+/* The same, with the true cost and the worst violation, and multipliers for the next plan; a solution that is only one of a
+ * race is stored as it is compared. Returns the status: whatever the algorithm says, a solution keeps its limits. */
+static int64_t store_limited(const mpc_problem *m, const mpc_batch *b, lanes *w, int lane, int64_t i, int64_t status,
+                             int64_t iterations) {
+    store_lane(m, b, w, lane, i, status, iterations);
+    if (m->race) return b->status[i];
+    vd cost, violation, worst, now, off[LIMITS];
+    appraise(m, w, &cost, &violation, &worst, &now);
+    b->J[i] = cost[lane], b->violation[i] = violation[lane], b->now[i] = now[lane], b->worst[i] = (int64_t)worst[lane];
+    double amount = w->c.h[b->worst[i]][lane];
+    b->amount[i] = violation[lane] > 0.0 ? amount : 0.0;
+    store_limits(m, b, w, lane, i);
+    if (status == ITERATION_LIMIT && b->status[i] == status) { /* near enough */
+        vd overpaid = distances(m, w, off);
+        vl near = acceptable(m, w) & is_near(w, off, overpaid);
+        if (near[lane]) b->status[i] = CONVERGED;
+        else if (violation[lane] > FEASIBLE && is_hopeless(w)[lane]) b->status[i] = INFEASIBLE;
+    }
+    if (b->status[i] == CONVERGED && !(violation[lane] <= FEASIBLE)) b->status[i] = INFEASIBLE; /* by an imposed input */
+    return b->status[i];
+}
+#endif
 
 /* Whether what a start has reached and what it promises are no better than a solution of the same problem. */
 static int is_beaten(const lanes *w, int lane, double best) {
@@ -132,14 +222,33 @@ static void solve_range(const mpc_problem *m, const mpc_batch *b, lanes *w, int6
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
             w->J = vd_select(fresh, J, w->J);
             w->size = vd_select(fresh, size, w->size);
+#if LIMITS
+            w->c.base = vd_select(fresh, w->c.base_new, w->c.base);
+            w->c.base_size = vd_select(fresh, w->c.base_size_new, w->c.base_size);
+            for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k)
+                w->c.h[k] = vd_select(fresh, w->c.h_new[k], w->c.h[k]);
+#endif
         }
         vl wanted = no_lanes(), converged, moved, stalled;
         for (int l = 0; l < LANES; ++l) wanted[l] = -(problem[l] >= 0);
         iterate(m, w, wanted, &converged, &moved, &stalled);
+#if LIMITS
+        vl lost = m->race ? no_lanes() : tighten(m, w, &converged, &stalled);
+#endif
         for (int l = 0; l < LANES; ++l) {
             if (problem[l] < 0) continue;
             int64_t status = converged[l] ? CONVERGED : stalled[l] ? STALLED : RUNNING;
             ++count[l];
+#if LIMITS
+            if (lost[l]) status = INFEASIBLE;
+            if (status == RUNNING && count[l] >= m->max_iterations) status = ITERATION_LIMIT;
+            if (b->rivals && status == RUNNING && is_beaten(w, l, best)) status = ITERATION_LIMIT;
+            if (status != RUNNING) {
+                status = store_limited(m, b, w, l, problem[l], status, count[l]);
+                if (b->rivals && status == CONVERGED && b->J[problem[l]] < best) best = b->J[problem[l]];
+                problem[l] = -1;
+            }
+#else
             if (status == RUNNING && count[l] >= m->max_iterations)
                 status = acceptable(m, w)[l] ? CONVERGED : ITERATION_LIMIT;
             if (b->rivals && status == CONVERGED && w->J[l] < best) best = w->J[l];
@@ -148,6 +257,7 @@ static void solve_range(const mpc_problem *m, const mpc_batch *b, lanes *w, int6
                 store_lane(m, b, w, l, problem[l], status, count[l]);
                 problem[l] = -1;
             }
+#endif
         }
     }
 }
@@ -163,8 +273,58 @@ static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, co
             for (int64_t k = 0; k < size; ++k) w->u[k][l] = u0 && k < NU ? u0[k] : candidates[(c + l) * size + k];
         vd size, cost = rollout_open(m, w, w->x, w->u, &size);
         for (int l = 0; l < LANES; ++l) J[c + l] = cost[l] < INFINITY ? cost[l] : INFINITY;
+#if LIMITS
+        if (w->c.asked) note(m, w, w->c.asked);
+#endif
     }
 }
+
+#if LIMITS
+/* Multipliers of zero, and weights and scales by the candidates, for a problem and for all lanes. */
+static void first_limits(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
+                         int64_t n_candidates, lanes *w, double *rows) {
+    double *memory = malloc(SURVEY_SIZE * sizeof(double));
+    double *rho = rows + (m->horizon + 1) * LIMITS, costs[MOST_CANDIDATES];
+    w->c.given = b->u0 != NULL;
+    for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) rows[k] = 0.0, w->c.multiplier[k] = V(0.0);
+    for (int j = 0; j < LIMITS; ++j) rho[j] = rho[LIMITS + j] = rho[2 * LIMITS + j] = 1.0;
+    if (memory) {
+        survey s = survey_in(memory);
+        w->c.asked = &s;
+        candidate_costs(m, w, b->x0 + i * NX, b->theta + i * b->theta_stride, b->u0 ? b->u0 + i * NU : NULL, candidates,
+                        n_candidates, costs);
+        w->c.asked = NULL;
+        conclude(m, &s, rho + LIMITS, rho + 2 * LIMITS);
+        free(memory);
+    }
+    for (int j = 0; j < LIMITS; ++j) {
+        rho[j] = rho[LIMITS + j];
+        w->c.rho[j] = w->c.first_rho[j] = V(rho[j]);
+        w->c.scale[j] = V(rho[2 * LIMITS + j]);
+    }
+    weigh(&w->c);
+}
+
+/* What first_limits says of problems, to limits; of plans whose inputs are in u_guess, violation and worst. */
+int mpc_limits(const mpc_problem *m, const mpc_batch *b, const double *candidates, int64_t n_candidates) {
+    lanes *w = lanes_new(m->horizon);
+    if (!w) return 1;
+    for (int64_t i = 0; i < b->n; ++i) {
+        first_limits(m, b, i, candidates, n_candidates, w, b->limits + i * MULTIPLIER_ROWS(m->horizon) * LIMITS);
+        if (!b->u_guess) continue;
+        vd size, cost, violation, worst, now;
+        for (int64_t k = 0; k < m->horizon * NU; ++k) w->u[k] = V(b->u_guess[i * m->horizon * NU + k]);
+        w->J = rollout_open(m, w, w->x, w->u, &size);
+        for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) w->c.h[k] = w->c.h_new[k];
+        w->c.base = w->c.base_new;
+        appraise(m, w, &cost, &violation, &worst, &now);
+        b->violation[i] = violation[0] > FEASIBLE ? violation[0] : 0.0;
+        b->worst[i] = (int64_t)worst[0];
+    }
+    lanes_free(w);
+    return 0;
+}
+#endif
 
 int mpc_solve(const mpc_problem *m, const mpc_batch *b, int64_t first, int64_t stride) {
     lanes *w = lanes_new(m->horizon);
@@ -201,6 +361,9 @@ static void race(const mpc_problem *m, mpc_batch *starts, lanes *w, int64_t *cho
     int64_t N = m->horizon;
     mpc_problem short_one = *m;
     if (short_one.max_iterations > RACE_ITERATIONS) short_one.max_iterations = RACE_ITERATIONS;
+#if LIMITS
+    short_one.race = 1;
+#endif
     solve_range(&short_one, starts, w, 0, 1);
     for (int64_t l = 0; l < starts->n; ++l) {
         *iterations += starts->iterations[l];
@@ -223,18 +386,26 @@ static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, cons
                        int64_t n_candidates, double *J, lanes *w, mpc_batch *starts, int64_t *chosen) {
     int64_t N = m->horizon, best = 0, iterations = 0;
     starts->theta = b->theta + i * b->theta_stride;
+#if LIMITS
+    first_limits(m, b, i, candidates, n_candidates, w, (double *)starts->limits_guess);
+#endif
     choose_starts(m, b, i, candidates, n_candidates, J, w, starts);
     mpc_batch finals = *starts;
     if (starts->n > 1) {
         race(m, starts, w, chosen, &iterations);
         finals.n = FINALISTS(starts->n);
-        finals.guess = ROLLOUT;
+        finals.guess = LIMITS ? INPUTS : ROLLOUT; /* with limits a rollout is more than its states and costs */
         finals.rivals = 1;
     }
     solve_range(m, &finals, w, 0, 1);
     for (int64_t l = 0; l < finals.n; ++l) {
         iterations += starts->iterations[l];
         int converged = starts->status[l] == CONVERGED, best_converged = starts->status[best] == CONVERGED;
+#if LIMITS
+        int first = keeps_better(starts->violation[l], starts->violation[best]);
+        if (first > 0) best = l;
+        if (first) continue;
+#endif
         if (goes_before(starts->J[l], converged, starts->J[best], best_converged)) best = l;
     }
     memcpy(b->u + i * N * NU, starts->u + best * N * NU, N * NU * sizeof(double));
@@ -243,13 +414,23 @@ static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, cons
     b->predicted[i] = starts->predicted[best];
     b->status[i] = starts->status[best];
     b->iterations[i] = iterations;
+#if LIMITS
+    int64_t rows = MULTIPLIER_ROWS(N) * LIMITS;
+    memcpy(b->limits + i * rows, starts->limits + best * rows, rows * sizeof(double));
+    b->violation[i] = starts->violation[best], b->now[i] = starts->now[best], b->worst[i] = starts->worst[best];
+    b->amount[i] = starts->amount[best];
+#endif
 }
 
 int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candidates, int64_t n_candidates,
                    int64_t n_starts, int64_t first, int64_t stride) {
     int64_t N = m->horizon, row = (N + 1) * NX + N * NU + NX + NU + 3;
+#if LIMITS
+    int64_t rows = MULTIPLIER_ROWS(N) * LIMITS;
+    row += 2 * rows + 3;
+#endif
     double *memory = calloc(n_starts * row + n_candidates, sizeof(double));
-    int64_t *flags = calloc(3 * n_starts, sizeof(int64_t));
+    int64_t *flags = calloc((LIMITS ? 4 : 3) * n_starts, sizeof(int64_t));
     lanes *w = lanes_new(N);
     int failed = !memory || !flags || !w;
     if (!failed) {
@@ -261,7 +442,15 @@ int mpc_solve_cold(const mpc_problem *m, const mpc_batch *b, const double *candi
         starts.u0 = b->u0 ? q : NULL; q += n_starts * NU;
         starts.J = q; q += n_starts;
         starts.predicted = q; q += n_starts;
-        starts.size = q;
+        starts.size = q; q += n_starts;
+#if LIMITS
+        starts.limits = q; q += n_starts * rows;
+        starts.limits_guess = q; q += n_starts * rows;
+        starts.violation = q; q += n_starts;
+        starts.now = q; q += n_starts;
+        starts.amount = q;
+        starts.worst = flags + 3 * n_starts;
+#endif
         for (int64_t i = first; i < b->n; i += stride)
             solve_cold(m, b, i, candidates, n_candidates, memory, w, &starts, flags + 2 * n_starts);
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import time
 from concurrent.futures import ThreadPoolExecutor
-from ctypes import POINTER, c_char, c_double, c_int, c_int64, c_void_p
+from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,11 @@ from mpcoffline.solvers.status import Stats, Status
 
 from .build import compiled
 from .codegen import source
+from .limited import Limited, address, better
 from .rounding import Rounding
 
-_STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE)  # by the kernel's codes
+# By the kernel's codes.
+_STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE, Status.INFEASIBLE)
 _LANES = 8
 
 
@@ -40,6 +42,7 @@ class _Problem(ctypes.Structure):
         ("unit", c_void_p),
         ("max_iterations", c_int64),
         ("tolerance", c_double),
+        ("race", c_int),  # with limits only
     )
 
 
@@ -63,6 +66,13 @@ class _Batch(ctypes.Structure):
         ("x_guess", c_void_p),
         ("u_guess", c_void_p),
         ("rivals", c_int),
+        ("limits_guess", c_void_p),  # from here on with limits only
+        ("limits_stride", c_int64),
+        ("limits", c_void_p),
+        ("violation", c_void_p),
+        ("now", c_void_p),
+        ("worst", c_void_p),
+        ("amount", c_void_p),
     )
 
 
@@ -71,7 +81,9 @@ class DDPSolver(Solver):
     """Control-limited differential dynamic programming with Gauss-Newton Hessians, eight problems an instruction.
 
     Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
-    and cached. Input bounds are handled exactly (a box QP at each stage); there are no other constraints. Costs whose
+    and cached. Input bounds are handled exactly (a box QP at each stage), other limits, hard and soft, by an augmented
+    Lagrangian: minimisations with multipliers that are made better after each, until every limit is kept to a millionth
+    of what it is measured by (how far it moves along the plan, or what the candidates make of it). Costs whose
     class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian; stage costs that
     are linear in the states (prices) with the curvature of the model besides, as they have none of their own, unless
     the model is large (a network).
@@ -81,26 +93,32 @@ class DDPSolver(Solver):
     plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
     Otherwise it is the best plan found, and ``status`` says why it was not accepted: ``"iteration limit"``,
-    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), or ``"not finite"``.
+    ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), ``"infeasible"`` (a hard limit
+    cannot be kept, however much is paid for it: the plan violates it by little more than it must), or ``"not finite"``;
+    ``words`` name the limit that is violated most. A hard limit that the given state violates, and no input can change,
+    is reported in ``stats["violation_now"]``, not imposed. Multipliers travel in the plan, but for those of failures.
 
     Slopes that jump or are infinite (``fmax``, ``fabs``, ``if_else``, saturations, dead zones, ``sqrt`` or ``v**0.8``
     at 0) stop a method that follows them. What is not solved because of them is solved with the corners rounded over
     1 % of each quantity's range, and again exactly from there; the better plan of the exact model is returned, and it
     counts as solved if the rounded problem was. The first time, the log says which corners there are.
 
-    References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
+    References: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014. Rockafellar,
+    "Augmented Lagrangians and applications of the proximal point algorithm in convex programming", 1976,
+    doi:10.1287/moor.1.2.97.
 
     Args:
-        mpc: The problem; without constraints other than input bounds.
-        max_iterations: Bound on the iterations of a problem.
+        mpc: The problem.
+        max_iterations: Bound on the iterations of a problem, with limits of all its minimisations together.
         tolerance: Predicted decrease of the cost, relative to the magnitudes of its stages (their constants left out),
             below which a problem is solved; 1000 times as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
         n_threads: Threads that share a batch; a batch of up to eight problems uses one.
-        round_corners: Whether to round corners for what is not solved; exported C never does.
+        round_corners: Whether to round corners for what is not solved; exported C never does, nor is it done under
+            limits.
 
     Raises:
-        InvalidArgumentError: For an MPC with constraints, or functions without a counterpart in C.
+        InvalidArgumentError: For functions without a counterpart in C, or more of them than compilers take.
         CompilerError: If there is no working C compiler.
     """
 
@@ -149,18 +167,22 @@ class DDPSolver(Solver):
         )
         self._constant = cost_constant(mpc)
         self._own_constant = float(self._constant(self._theta))
-        compared = n_starts if is_convex(mpc) else N_CANDIDATES  # any start leads to the only minimum
+        self._limited = None if mpc.constraints is None else Limited(mpc)
+        if self._limited is not None:
+            library.mpc_limits.argtypes = (problem, batch, c_void_p, c_int64)
+        # Any start leads to the only minimum; but all say how large limits are.
+        compared = n_starts if is_convex(mpc) and self._limited is None else N_CANDIDATES
         self._candidates = np.ascontiguousarray(candidate_inputs(mpc)[:compared])
-        self._starts = _address(self._candidates), len(self._candidates), n_starts
+        self._starts = address(self._candidates), len(self._candidates), n_starts
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
         self._n_threads = n_threads
         self._rounding: Rounding | None = None
-        self._round_corners = bool(round_corners)
+        self._round_corners = bool(round_corners) and self._limited is None
 
-    @classmethod
-    def refuses(cls, mpc: MPC) -> str:
-        """See :meth:`Solver.refuses`."""
-        return "" if mpc.constraints is None else "constraints other than input bounds"
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """What the elements of limits are called, in the order of multipliers; none where there are no limits."""
+        return self._limited.labels if self._limited is not None else ()
 
     def _solve(self, x: Array, theta: Array, u0: Array | None, warm_start: Plan | None) -> Solution:
         start = time.perf_counter()
@@ -180,7 +202,20 @@ class DDPSolver(Solver):
             value = value + self._constant(theta.T).full()[0]
         elif self._own_constant:
             value = value + self._own_constant
-        return Solution(result["u"][:, 0].copy(), result["x"], result["u"], value, status == 0, ended, stats)
+        if self._limited is not None:
+            stats["violation"] = result["amount"]
+            stats["violation_now"] = result["now"]
+            if np.count_nonzero(status):
+                stats["words"] = self._limited.words(result, ended)
+                result["multipliers"][status != 0] = np.nan
+        arrays = result["u"][:, 0].copy(), result["x"], result["u"], value, status == 0
+        return Solution(*arrays, ended, stats, result.get("multipliers"))
+
+    def violation(self, x: Array, u: Array) -> Array:
+        """See :meth:`Solver.violation`; in what each limit is measured by."""
+        if self._limited is None:
+            return np.zeros(len(x))
+        return self._survey(x, self._theta, None, u)["violation"]
 
     def _rounded(self) -> Rounding:
         """What solves the problem where its corners stand in the way; made when it is first needed."""
@@ -217,7 +252,7 @@ class DDPSolver(Solver):
             again = self._run(x[lost], _rows(theta, lost), None if u0 is None else u0[lost], None)
             # A plan that is not accepted either is only taken if it is better.
             rows = np.flatnonzero(lost)
-            taken = (again["status"] == 0) | ~(again["J"] >= result["J"][rows])
+            taken = better(again, {name: result[name][rows] for name in again})
             result["iterations"][rows] += again.pop("iterations")
             for name, array in again.items():
                 result[name][rows[taken]] = array[taken]
@@ -228,7 +263,7 @@ class DDPSolver(Solver):
     ) -> dict[str, NDArray[Any]]:
         """Warm and cold problems of one batch, solved apart and put together in order."""
         merged: dict[str, NDArray[Any]] = {}
-        for chosen, warm in ((known, Plan(plan.x[known], plan.u[known])), (~known, None)):
+        for chosen, warm in ((known, plan.rows(known)), (~known, None)):
             part = self._run(x[chosen], _rows(theta, chosen), None if u0 is None else u0[chosen], warm)
             for name, array in part.items():
                 merged.setdefault(name, np.empty((len(x), *array.shape[1:]), array.dtype))[chosen] = array
@@ -243,13 +278,13 @@ class DDPSolver(Solver):
         # What it writes, in one piece of memory: for one problem, allocations would take long.
         n_x, n_u = n * (mpc.horizon + 1) * mpc.nx, n * mpc.horizon * mpc.nu
         memory = np.empty(n_x + n_u + 4 * n)
-        reached = _address(memory)
+        reached = address(memory)
         inputs, figures, row = reached + 8 * n_x, reached + 8 * (n_x + n_u), 8 * n
         batch = _Batch(
             n=n,
-            x0=_address(x),
-            theta=_address(theta),
-            u0=None if u0 is None else _address(u0),
+            x0=address(x),
+            theta=address(theta),
+            u0=None if u0 is None else address(u0),
             theta_stride=theta.shape[1] if theta.ndim == 2 else 0,
             x=reached,
             u=inputs,
@@ -259,8 +294,14 @@ class DDPSolver(Solver):
             status=figures + 3 * row,
         )
         if plan is not None:
-            plan = Plan(_plain(plan.x), _plain(plan.u))
-            batch.x_guess, batch.u_guess = _address(plan.x), _address(plan.u)
+            y = None if self._limited is None else self._multipliers(x, theta, u0, plan)
+            plan = Plan(_plain(plan.x), _plain(plan.u), y)
+            batch.x_guess, batch.u_guess = address(plan.x), address(plan.u)
+            if y is not None:
+                batch.limits_guess, batch.limits_stride = address(y), y[0].size
+        more = {} if self._limited is None else self._limited.results(n)
+        for name, array in more.items():
+            setattr(batch, "limits" if name == "multipliers" else name, address(array))
         if self._call(batch, cold=plan is None):
             raise MemoryError(f"solving {n} MPCs: the kernel could not allocate its work space")
         values = memory[n_x + n_u :].reshape(4, n)
@@ -272,7 +313,41 @@ class DDPSolver(Solver):
             "predicted": values[1],
             "iterations": integers[2],
             "status": integers[3],
+            **more,
         }
+
+    def _multipliers(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> Array:
+        """Those of a plan; where nothing is known of them, zeros, with weights that the candidates give."""
+        assert self._limited is not None  # noqa: S101 -- asked with limits only; narrows the type
+        unknown = np.ones(len(x), dtype=bool)
+        if plan.multipliers is not None:
+            self._limited.check(plan.multipliers, len(x))
+            if not (unknown := self._limited.unknown(plan.multipliers)).any():
+                return _plain(plan.multipliers)
+        found = self._limited.results(len(x))["multipliers"] if plan.multipliers is None else plan.multipliers.copy()
+        some = None if u0 is None else u0[unknown]
+        found[unknown] = self._survey(x[unknown], _rows(theta, unknown), some, None)["multipliers"]
+        return found
+
+    def _survey(self, x: Array, theta: Array, u0: Array | None, u: Array | None) -> dict[str, NDArray[Any]]:
+        """Multipliers to begin with; the violations of plans with inputs u ``(B, N, nu)``, where they are given."""
+        assert self._limited is not None  # noqa: S101 -- asked with limits only; narrows the type
+        n, x, theta = len(x), _plain(x), _plain(theta)
+        u0, u = (None if inputs is None else _plain(inputs) for inputs in (u0, u))
+        batch = _Batch(
+            n=n,
+            x0=address(x),
+            theta=address(theta),
+            u0=None if u0 is None else address(u0),
+            theta_stride=theta.shape[1] if theta.ndim == 2 else 0,
+            u_guess=None if u is None else address(u),
+        )
+        found = self._limited.results(n)
+        for name, array in found.items():
+            setattr(batch, "limits" if name == "multipliers" else name, address(array))
+        if self._library.mpc_limits(ctypes.byref(self._problem), ctypes.byref(batch), *self._starts[:2]):
+            raise MemoryError(f"looking at {n} MPCs: the kernel could not allocate its work space")
+        return found
 
     def _call(self, batch: _Batch, *, cold: bool) -> int:
         """Runs the kernel on a batch, in several threads if there are; returns how many failed."""
@@ -296,12 +371,6 @@ def _rows(theta: Array, chosen: NDArray[np.bool_]) -> Array:
 
 
 def _plain(array: Array) -> Array:
-    """An array as C and :func:`_address` take it: contiguous and writable."""
+    """An array as C and :func:`~mpcoffline.solvers.ddp.limited.address` take it: contiguous and writable."""
     array = np.ascontiguousarray(array, dtype=np.float64)
     return array if array.flags.writeable else array.copy()
-
-
-def _address(array: NDArray[Any]) -> int:
-    """Where the first number of an array is; three times faster than ``array.ctypes.data``."""
-    buffer: Any = array  # that arrays are buffers is in numpy's types from Python 3.12 on
-    return ctypes.addressof(c_char.from_buffer(buffer)) if array.size else 0

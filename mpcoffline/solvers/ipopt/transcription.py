@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Penalty
+from mpcoffline.solvers.limits import depends_on_input, element_names
 from mpcoffline.solvers.scaling import costs_of
 from mpcoffline.solvers.starts import N_CANDIDATES
 
@@ -121,9 +122,12 @@ class Transcription:
             if penalty is not None:
                 soft.append((h, penalty, k))
                 return
-            hard.append(h)
-            elements = [name] if h.numel() == 1 else [f"{name}[{i}]" for i in range(h.numel())]
-            self.labels += [(element, k) for element in elements]
+            names = element_names(name, h.numel())
+            # The given state may violate what no input can change: that is no infeasibility of what is planned.
+            kept = np.flatnonzero(depends_on_input(h, self._inputs[0]) | (k > 0)).tolist()
+            if kept:
+                hard.append(h[kept])
+            self.labels += [(names[j], k) for j in kept]
 
         for k, u in enumerate(self._inputs):
             for constraint in mpc.constraints_at("stages"):

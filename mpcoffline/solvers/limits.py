@@ -1,0 +1,89 @@
+"""The limits of an MPC besides input bounds, element by element: hard and soft, along the horizon and at its end."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.core.types import Array
+from mpcoffline.mpc import MPC, Penalty, StateBounds
+
+
+class Limits(NamedTuple):
+    """All elements h_j <= 0, in three blocks: of constraints along the horizon, of state bounds, of those at the end.
+
+    Attributes:
+        stage: What holds at the stages 0 ... N - 1: the first two blocks, bounds from stage 1 on.
+        end: What holds at N: the last two blocks.
+        labels: The name of each element.
+        l1: Price of a violation, ``(n,)``; inf where the limit is hard.
+        l2: Price of its square.
+        n_stage: Elements of the first block.
+        n_bounds: Of the second.
+        by_input: Which elements depend on the input, ``(n,)``: no other one can be changed at stage 0.
+    """
+
+    stage: ca.SX
+    end: ca.SX
+    labels: tuple[str, ...]
+    l1: Array
+    l2: Array
+    n_stage: int
+    n_bounds: int
+    by_input: NDArray[np.bool_]
+
+
+def limits_of(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> Limits | None:
+    """The limits in these symbols; None where there are none."""
+    labels: list[str] = []
+    penalties: list[Penalty | None] = []
+
+    def add(names: list[str], penalty: Penalty | None) -> None:
+        labels.extend(names)
+        penalties.extend([penalty] * len(names))
+
+    along, bounds, end = ca.SX(0, 1), ca.SX(0, 1), ca.SX(0, 1)
+    for constraint in mpc.constraints_at("stages"):
+        h = mpc.constraint_expression(constraint)(x, u, theta)
+        along = ca.vertcat(along, ca.densify(h))
+        add(element_names(constraint.name, h.numel()), constraint.soft)
+    for bound in mpc.state_bounds:
+        bounds = ca.vertcat(bounds, bound.expression(x))
+        add(_bound_names(bound), bound.soft)
+    for constraint in mpc.constraints_at("end"):
+        h = mpc.constraint_expression(constraint)(x, theta)
+        end = ca.vertcat(end, ca.densify(h))
+        add(element_names(constraint.name, h.numel()), constraint.soft)
+    if not labels:
+        return None
+    by_input = np.zeros(len(labels), dtype=bool)
+    by_input[: along.numel()] = depends_on_input(along, u)
+    return Limits(
+        ca.vertcat(along, bounds),
+        ca.vertcat(bounds, end),
+        tuple(labels),
+        np.array([np.inf if p is None else p.l1 for p in penalties]),
+        np.array([0.0 if p is None else p.l2 for p in penalties]),
+        along.numel(),
+        bounds.numel(),
+        by_input,
+    )
+
+
+def depends_on_input(h: ca.SX, u: ca.SX) -> NDArray[np.bool_]:
+    """Which elements of a column depend on the input."""
+    return np.array([bool(ca.depends_on(h[j], u)) for j in range(h.numel())], dtype=bool)
+
+
+def element_names(name: str, n: int) -> list[str]:
+    """What the n elements of a constraint are called."""
+    return [name] if n == 1 else [f"{name}[{i}]" for i in range(n)]
+
+
+def _bound_names(bounds: StateBounds) -> list[str]:
+    """By the states that they are of, in the order of ``StateBounds.expression``."""
+    high, low = np.isfinite(np.asarray(bounds.high)), np.isfinite(np.asarray(bounds.low))
+    return [f"{bounds.name}[{i}]" for i in [*np.flatnonzero(high), *np.flatnonzero(low)]]
