@@ -227,11 +227,6 @@ def test_bad_options_are_refused(options: dict[str, int], name: str) -> None:
         DDPSolver(nominal_mpc(PENDULUM), **options)
 
 
-def test_constraints_are_refused() -> None:
-    with pytest.raises(InvalidArgumentError, match="constraints"):
-        DDPSolver(nominal_mpc(PENDULUM).replace(constraints=lambda x, u, p: x[2] - 5.0))
-
-
 @pytest.mark.parametrize("limit", [6, 10, 16])
 def test_what_the_iteration_limit_accepts_is_solved(limit: int) -> None:
     """Going on from there changes value and input by next to nothing."""
