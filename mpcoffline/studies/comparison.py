@@ -156,8 +156,8 @@ def run_group(group: CaseGroup, n_episodes: int) -> list[Row]:
 def _learned(
     nominal: MPC, table: TransitionTable, values: dict[str, ValueFunction], name: str, learn: Learn, **options: Any
 ) -> tuple[OfflineMPCLearner, float]:
-    """A fitted learner and its seconds; value functions of the same name are learned once."""
-    learner = OfflineMPCLearner(nominal, learn, seed=0, value_function=values.get(name), **options)
+    """A learner with its whole fit, and its seconds; value functions of the same name are learned once."""
+    learner = OfflineMPCLearner(nominal, learn, candidate="full", seed=0, value_function=values.get(name), **options)
     start = time.perf_counter()
     learner.fit(table, show_progress=False)
     if learner.value_function is not None:
