@@ -96,7 +96,7 @@ def identify(
     with a wrong one it predicts farther, and controllers on it were no better.
 
     Parameters with ``varies="episode"`` are found for each episode from there on, with one-step errors
-    (:func:`~mpcoffline.estimation.episodes.by_episode`); theta has their mean.
+    (``mpcoffline.estimation.episodes.by_episode``); theta has their mean.
 
     Example:
         >>> found = mpcoffline.estimation.identify(mpc, table)

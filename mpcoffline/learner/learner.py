@@ -72,7 +72,7 @@ class OfflineMPCLearner:
             recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
             longest.
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
-        candidate: Which of the :attr:`candidates` is handed out. ``"auto"`` tries them on models of the log and takes
+        candidate: Which of the ``candidates`` is handed out. ``"auto"`` tries them on models of the log and takes
             the best, MPC_1 where none is better; that solves MPCs, learning does not. ``"full"``, or another name,
             takes that one and tries nothing. The paper's preset has no others than the whole fit.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
