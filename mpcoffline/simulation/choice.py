@@ -33,7 +33,7 @@ def choose(
     """Tries MPCs on the models of the log and names the best.
 
     In rounds, each with more starts: after each, those leave that cost clearly more than the best. The best has the
-    least mean cost on the median model, of those that have a vote. It is taken if it costs less than ``"MPC_1"`` by
+    least mean cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by
     both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the
     second best is asked; where no model has a vote, ``"MPC_1"`` stays.
 

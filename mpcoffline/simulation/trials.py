@@ -106,16 +106,17 @@ class Trials:
         return np.asarray(costs[self.names.index(name)] - costs[0])
 
     def improves(self, name: str) -> bool:
-        """Whether it costs less than MPC_1 on the median model, by both regressions.
+        """Whether it costs no more than MPC_1 on the median model, by both regressions.
 
-        From all starts; those that had no part in the choice may not say otherwise beyond a standard error.
+        From all starts; those that had no part in the choice may not say otherwise beyond a standard error. Where there
+        is no difference at all, what was identified predicts the log better, and is taken.
         """
         for second in (False, True):
             gains = self.differences(name, second=second)[self.votes]
             middle = int(np.argsort(gains.mean(axis=1), kind="stable")[len(gains) // 2])
             fresh = gains[middle][self.judged]
             error = fresh.std() / np.sqrt(len(fresh)) if len(fresh) else 0.0
-            if not gains[middle].mean() < 0.0 or (len(fresh) and fresh.mean() > error):
+            if not gains[middle].mean() <= 0.0 or (len(fresh) and fresh.mean() > error):
                 return False
         return True
 

@@ -155,7 +155,8 @@ def test_the_best_of_some_is_chosen_and_the_worse_leave_early() -> None:
     assert chosen == "best"
     assert not np.isnan(trials.of("best")).any()
     assert np.isnan(trials.of("lazy")).any()
-    assert choose({FIRST: TRUE_MPC, "lazy": lazy}, around)[1] == FIRST
+    assert choose({FIRST: TRUE_MPC, "wrong": wrong}, around)[1] == FIRST
+    assert choose({FIRST: TRUE_MPC, "same": TRUE_MPC.replace(horizon=TRUE_MPC.horizon)}, around)[1] == "same"
 
 
 def test_variants_of_what_is_good_are_tried_too() -> None:
