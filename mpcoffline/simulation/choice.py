@@ -19,7 +19,7 @@ _SLOW = 10.0  # times as fast as ipopt
 _ROUNDS = (8, 20, 40)  # starts until the end of each; what is left judges
 _CLEAR = 2.0  # standard errors
 _TRIFLE = 0.01  # of the gain over MPC_1: what is better by less is no better
-_JUDGED = 2  # of the best at most, one after the other
+_JUDGED = 3  # of the best at most, one after the other
 _VARIED = 3  # of the best, variants are tried
 
 
@@ -35,7 +35,7 @@ def choose(
     In rounds, each with more starts: after each, those leave that cost clearly more than the best. The best has the
     least mean cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by
     both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the
-    second best is asked; where no model has a vote, ``"MPC_1"`` stays.
+    next best is asked; where no model has a vote, ``"MPC_1"`` stays.
 
     Args:
         mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
