@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, smooth
+from mpcoffline.estimation.plant import state_rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.seen import sees_memory
 
@@ -38,7 +38,7 @@ def surroundings_of(
     Args:
         mpc: A learned MPC, for what its states are made of.
         nominal: MPC_1; its stage cost may be the logged one.
-        table: The transitions as they were logged.
+        table: The transitions as they were logged, or of the MPC's states.
         found: What was identified.
         slow: Whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best models only.
         n_starts: Number of episodes on each model; 64 by default, half of them where an episode of the log began, if
@@ -49,7 +49,7 @@ def surroundings_of(
     Raises:
         InvalidDataError: If the data have other dimensions than the MPC.
     """
-    logged = with_memory(table, mpc.layout)
+    logged = state_rows(mpc, table)
     identified = nominal.with_delay(mpc.layout.delay).replace(model=found.model)
     clean = logged
     if len(found.table) == len(logged):

@@ -8,6 +8,7 @@ from pathlib import Path
 import lq_plant
 import numpy as np
 import pytest
+from late_plants import belt_log, belt_mpc
 from lq_episodes import episodes
 from lq_plant import QuadraticValue
 
@@ -85,6 +86,16 @@ def test_where_nothing_can_be_gained_mpc_1_is_kept() -> None:
     own, first = (report.trials.of(name).mean() for name in (report.judgement.proposal, "MPC_1"))
     assert own == pytest.approx(first, rel=0.02)
     assert "MPC_1" in report.reasons[0]
+
+
+def test_a_dead_time_that_the_fit_found_is_known_to_the_diagnosis() -> None:
+    log = belt_log(3)
+    learner = OfflineMPCLearner(belt_mpc(), value_n_steps=200, hidden=(16,), terminal="quadratic", seed=0)
+    learner.fit(log, show_progress=False)
+    report = diagnose(learner, log)
+    assert report.verdict == "recommend"
+    assert not report.lag.found
+    assert report.judgement.today.known
 
 
 def test_late_inputs_are_found() -> None:
