@@ -66,8 +66,7 @@ def diagnose(
     (:class:`~mpcoffline.simulation.models.LogModels`), from the same starts of the log, under what disturbed it then,
     with the user's own stage cost or one learned from the logged costs
     (:class:`~mpcoffline.simulation.logged_cost.LoggedCost`); models and starts are others than those of the choice in
-    ``fit``. So does a clone of the controller that made the log. That decides the verdict
-    (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
+    ``fit``. That decides the verdict (``mpcoffline.diagnostics.verdict``); all else is reported beside it.
 
     Example:
         >>> report = mpcoffline.diagnose(learner, "mpcoffline/pendulum/ddpg-v0")

@@ -254,7 +254,8 @@ def _of_today(today: Today, trials: Trials, name: str) -> tuple[str, ...]:
         also = " MPC_1 is, too." if name != trials.names[0] and Today.of(trials, trials.names[0]).dearer else ""
     if worse:
         return (
-            f"{name} is worse than {logged}: {span} an episode, whether by the log or by a clone.{also} Keep that.",
+            f"{name} is worse than {logged}: {span} an episode, whether by the log or by a clone.{also} Keep"
+            " what runs today.",
         )
     if np.isfinite(today.disagreement).any():
         gap = float(np.nanmedian(today.disagreement))

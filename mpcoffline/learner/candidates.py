@@ -75,13 +75,12 @@ class Candidates(Mapping[str, MPC]):
             return "Handed out: MPC_1. No model predicts the log, so nothing could be tried."
         where = f"of {len(self)} candidates in closed loop with {votes} model{'s' * (votes > 1)} of the log"
         if self.chosen == FIRST:
-            return f"Handed out: MPC_1, the best {where}."
+            return f"Handed out: MPC_1. None {where} is better for sure."
         gain = np.nanmean(self.trials.differences(self.chosen)[self.trials.votes], axis=1)
         level = np.nanmean(self.trials.of(FIRST)[self.trials.votes], axis=1)
-        return (
-            f"Handed out: {self.chosen!r}, the best {where}: an episode costs {np.median(gain):+.3g} beside MPC_1's"
-            f" {np.median(level):.4g}."
-        )
+        less, other = -float(np.median(gain)), f"MPC_1's {np.median(level):.4g}"
+        cost = f"{less:.3g} less than {other}" if less > 0.0 else f"as much as {other}"
+        return f"Handed out: {self.chosen!r}, the best {where} that was confirmed: an episode costs {cost}."
 
     def __str__(self) -> str:
         """A line each: cost of an episode less that of MPC_1, over the models that have a vote."""
@@ -134,7 +133,8 @@ class Candidates(Mapping[str, MPC]):
             raise FileFormatError("candidates", expected="the chosen one and the whole fit", actual=str(chosen))
         if models is not None:
             own = {name.removeprefix(TRIALS): v for name, v in arrays.items() if name.startswith(TRIALS)}
-            trials = Trials.from_arrays(tuple(mpcs), tuple(map(str, models)), own)
+            named = tuple(check_name("model", name, error=FileFormatError) for name in models)
+            trials = Trials.from_arrays(tuple(mpcs), named, own)
         return cls(mpcs, chosen, trials)
 
 

@@ -46,7 +46,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost",
 
 
 class OfflineMPCLearner:
-    r"""Learns the parameters of an MPC from logged transitions, without solving one MPC.
+    r"""Learns the parameters of an MPC from logged transitions, without solving one MPC; then tries what it learned.
 
     Two regressions on the data set D, with the stage cost L (= -reward), discount gamma and successor s+::
 

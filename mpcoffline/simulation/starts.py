@@ -55,7 +55,7 @@ def returns_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) 
 
     An episode that ends in a terminal state costs nothing afterwards; one that is cut off before ``n_steps`` gives NaN.
     """
-    lasts = np.append(table.episodes.firsts[1:], len(table)) - 1
+    lasts = np.append(np.sort(table.episodes.firsts)[1:], len(table)) - 1  # ids need not rise
     own = lasts[np.searchsorted(lasts, rows)]
     ends = np.minimum(own, rows + n_steps - 1)
     total = np.concatenate([[0.0], np.cumsum(table.values().costs)])

@@ -115,6 +115,8 @@ def test_what_the_log_cost_is_known_where_it_goes_on_or_ends_for_good() -> None:
     x = np.zeros((10, 1))
     log = TransitionTable.from_arrays(x, x, costs, x, ends, np.repeat([0, 1], 5))
     np.testing.assert_array_equal(returns_along(log, np.array([0, 3, 5, 8]), 3), [3.0, 7.0, 18.0, np.nan])
+    falling = TransitionTable.from_arrays(x, x, costs, x, ends, np.repeat([7, 2], 5))
+    np.testing.assert_array_equal(returns_along(falling, np.array([0, 3, 5, 8]), 3), [3.0, 7.0, 18.0, np.nan])
 
 
 def trials_of(gains: dict[str, float], votes: list[bool]) -> Trials:
