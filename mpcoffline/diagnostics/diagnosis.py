@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -26,7 +26,7 @@ from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Trials
 
-from .differences import TODAY
+from .differences import TODAY, Difference
 from .figure import Traces
 from .measures import (
     bound_names,
@@ -99,14 +99,15 @@ def diagnose(
     chosen = FULL if learner.candidates is None else learner.candidates.chosen
     policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
     original, nominal = nominal, nominal.with_delay(learned.layout.delay)  # of the dead time that the learner has found
-    table = with_memory(TransitionTable.of(dataset), learned.layout)
+    logged = TransitionTable.of(dataset)
+    table = with_memory(logged, learned.layout)
     known = None if learner.result is None else learner.result.cost
     found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
     identified = nominal.replace(model=found.model)
     around = surroundings_of(
         learned,
         original,
-        table,
+        logged,
         found,
         slow=are_slow(policies.values()),
         n_starts=n_starts,
@@ -114,10 +115,11 @@ def diagnose(
         seed=seed + _FRESH,
     )
     clone = Behaviour.of(table, learned.layout, seed)
-    today = clone.replaying(clone.deviations(table, around.rows, around.n_steps))
-    trials, loops = _tried({**policies, TODAY: today}, around)
+    deviations = clone.deviations(table, around.rows, around.n_steps)
+    trials, loops = _tried(chosen, lambda starts: {**policies, TODAY: clone.replaying(deviations[starts])}, around)
     first, second = loops[FIRST], loops[chosen]
-    trust = _trust(agreement(around.models, around.cost, table, today, around.rows, around.n_steps), trials.votes)
+    today, rows = clone.replaying(deviations[: around.usual]), around.rows[: around.usual]
+    trust = _trust(agreement(around.models, around.cost, table, today, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
@@ -171,11 +173,25 @@ def diagnose(
     return report.with_notes(notes_on(report, fit))
 
 
-def _tried(controllers: Mapping[str, Controller], around: Surroundings) -> tuple[Trials, dict[str, Episodes]]:
-    """Closed loops of some controllers from the same starts, of which none had a part in any choice."""
-    trials = Trials.none(list(controllers), around, judged=np.ones(len(around.rows), dtype=bool))
-    every = slice(0, len(around.rows))
-    return trials, {name: trials.fill(name, around, controller, every) for name, controller in controllers.items()}
+def _tried(
+    proposal: str, controllers: Callable[[slice], Mapping[str, Controller]], around: Surroundings
+) -> tuple[Trials, dict[str, Episodes]]:
+    """Closed loops of some controllers from the same starts, of which none had a part in any choice.
+
+    The spare starts are tried, too, where the others do not tell whether the proposal is cheaper than MPC_1, and so
+    many may.
+
+    Returns:
+        The trials, and the closed loops from the usual starts.
+    """
+    usual, more = slice(0, around.usual), slice(around.usual, len(around.rows))
+    acting = controllers(usual)
+    trials = Trials.none(list(acting), around)
+    loops = trials.fill(acting, around, usual)
+    possible = more.start < more.stop and proposal != FIRST and trials.votes.any()
+    if possible and 1.0 < Difference.of(trials, proposal, FIRST).undecided <= more.stop / more.start:
+        trials.fill(controllers(more), around, more)
+    return trials.judged_from(0), loops
 
 
 def _trust(found: Agreement, votes: NDArray[np.bool_]) -> Trust | None:

@@ -71,6 +71,16 @@ class Difference:
         return np.asarray(self.mean - SURE * self.error > 0.0)
 
     @property
+    def undecided(self) -> float:
+        """How many times as many starts might tell whether it is cheaper; 1 where that is clear, inf where it is not.
+
+        As the median model has it.
+        """
+        k = self.middle
+        gain, doubt = -self.mean[k], SURE * self.error[k]
+        return 1.0 if self.agreed or not abs(gain) < doubt else float((doubt / gain) ** 2) if gain > 0.0 else np.inf
+
+    @property
     def agreed(self) -> bool:
         """Whether all models but one, if there are four or more, say that it is cheaper."""
         return len(self) > 0 and int(np.sum(~self.better)) <= outvoted(len(self))

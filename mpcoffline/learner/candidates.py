@@ -160,7 +160,7 @@ def tried(
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
     slow = are_slow(quick_policy(mpc) for mpc in (nominal, known.mpc))
-    around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, seed=known.seed)
+    around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:

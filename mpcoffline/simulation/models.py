@@ -20,7 +20,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layout import Layout
 
 from .invariants import Invariants
-from .members import Members, moved_parameters
+from .members import Members, finer, moved_parameters
 from .stops import Stops
 
 STEPS = 15  # that are predicted open loop to judge a model
@@ -98,6 +98,7 @@ class LogModels:
         Raises:
             InvalidDataError: If the data have other dimensions than the MPC.
         """
+        mpc = finer(mpc)
         states, rng = excerpt(state_rows(mpc, table), _EXCERPT, seed), np.random.default_rng(seed)
         rows, held_out = plant_rows(mpc, states), HeldOut.of(states.episode_ids, seed).rows
         free = np.flatnonzero(~held_out)
@@ -141,11 +142,16 @@ class LogModels:
         best = float(np.min(self.errors))
         return np.asarray((self.errors <= VOTES * max(best, NEGLIGIBLE)) & (best < self.baseline))
 
-    def asked(self, most: int | None = None) -> LogModels:
-        """Those that have a vote, no more than the best of some number, and the identified one."""
+    def asked(self, most: int | None = None, *, identified: bool = True) -> LogModels:
+        """Those that have a vote, no more than the best of some number, and the identified one.
+
+        Args:
+            most: The number; all by default.
+            identified: Whether that one is kept, whatever it predicts. It is where no other one has a vote.
+        """
         kept, best = self.votes, np.argsort(self.errors, kind="stable")
         kept[best[len(best) if most is None else most :]] = False
-        kept[0] = True
+        kept[0] |= identified or not kept.any()
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
         return replace(self, names=names, errors=self.errors[kept], members=self.members.some(kept))
 

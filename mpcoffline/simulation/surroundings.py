@@ -10,14 +10,15 @@ from mpcoffline.estimation.plant import state_rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.seen import sees_memory
 
-from .choice import STARTS
 from .logged_cost import LoggedCost
 from .models import LogModels
-from .starts import initial_rows
+from .starts import costs_before, initial_rows
 from .trials import Surroundings
 
+STARTS = 64
+_SPARE_CHOOSING, _SPARE = 40, 128
 _MOST_STEPS = 400
-_MOST_MODELS = 7
+_MOST_MODELS, _CHOOSING_MODELS = 7, 4
 _FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
 _LEAST_STEPS = 20  # of an episode, or a horizon
 
@@ -29,6 +30,7 @@ def surroundings_of(
     found: Identification,
     *,
     slow: bool = False,
+    choosing: bool = False,
     n_starts: int | None = None,
     n_steps: int | None = None,
     seed: int = 0,
@@ -41,8 +43,9 @@ def surroundings_of(
         table: The transitions as they were logged, or of the MPC's states.
         found: What was identified.
         slow: Whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best models only.
-        n_starts: Number of episodes on each model; 64 by default, half of them where an episode of the log began, if
-            it has as many.
+        choosing: Whether many controllers are tried: then on the four best models, whichever they are.
+        n_starts: Number of episodes on each model; by default 64, and others for where these decide nothing. They begin
+            where those of the log did; where it has fewer, in like states, too.
         n_steps: Their length; by default that of the logged ones that no end cut short, 400 at most.
         seed: Of models, starts and noise.
 
@@ -56,16 +59,20 @@ def surroundings_of(
         clean = found.table
     elif not found.noise.negligible:
         clean = smooth(identified, logged, found.theta, found.noise)
-    models = LogModels.of(identified, clean, found, seed=seed).asked(_FEW_MODELS if slow else _MOST_MODELS)
+    most_models = _FEW_MODELS if slow else _CHOOSING_MODELS if choosing else _MOST_MODELS
+    models = LogModels.of(identified, clean, found, seed=seed).asked(most_models, identified=not choosing)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
-    if n_starts is None:
-        n_starts = min(most_starts, max(STARTS // 2, 2 * clean.n_episodes))
-    rows = initial_rows(clean, n_starts, seed)
+    spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
+    rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)
     if n_steps is None:
         n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
-    return Surroundings(models, cost, clean, rows, n_steps, mpc.layout, seed)
+    n_before = mpc.layout.steps if len(clean) < len(table) else 0
+    before = costs_before(table, clean, rows, n_before)
+    return Surroundings(
+        models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare, before, n_before
+    )
 
 
 def _usual_length(table: TransitionTable) -> int:

@@ -48,14 +48,14 @@ class Trials:
 
     Attributes:
         names: Of the controllers; the first one is ``"MPC_1"``.
-        models: Names of the models; the first one is the identified one.
+        models: Names of the models; in a diagnosis the first one is the identified one.
         votes: Which models predict the log well enough to be asked, ``(models,)``.
         cost: Undiscounted cost of each episode, in the unit of the logged costs; NaN where it was not tried.
         second: The same with another regression of the logged cost.
         lost: Whether the state ran away, or the episode ended as bad ones do.
         rows: The row of the log that each start is, ``(starts,)``.
         returns: What the log itself cost from there over as many steps, ``(starts,)``; NaN where it ends before.
-        begun: The starts at which an episode of the log began, ``(starts,)``: they tell what an episode costs.
+        begun: The starts at which an episode of the log began, ``(starts,)``.
         judged: The starts that had no part in the choice among the controllers, ``(starts,)``.
         n_steps: Length of an episode.
     """
@@ -73,18 +73,22 @@ class Trials:
     n_steps: int
 
     @classmethod
-    def none(cls, names: Sequence[str], around: Surroundings, judged: NDArray[np.bool_]) -> Trials:
-        """Before the first."""
+    def none(cls, names: Sequence[str], around: Surroundings) -> Trials:
+        """Before the first; nothing is chosen by them yet."""
         shape = len(names), len(around.models), len(around.rows)
         cost, second, lost = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
         models, rows, returns = around.models, around.rows, around.returns
-        parts = cost, second, lost, rows, returns, around.begun, judged, around.n_steps
+        judged = np.ones(len(around.rows), dtype=bool)
+        parts = cost, second, lost, rows, returns, around.begun, judged, around.n_before + around.n_steps
         return cls(tuple(names), models.names, models.votes, *parts)
 
-    def fill(self, name: str, around: Surroundings, controller: Controller, starts: slice) -> Episodes:
-        """Adds what a controller does from some of the starts."""
-        done, k = around.act(controller, starts), self.names.index(name)
-        self.cost[k, :, starts], self.second[k, :, starts], self.lost[k, :, starts] = done.cost, done.second, done.lost
+    def fill(self, controllers: Mapping[str, Controller], around: Surroundings, starts: slice) -> dict[str, Episodes]:
+        """Adds what controllers do from some of the starts."""
+        done = dict(zip(controllers, around.act(list(controllers.values()), starts), strict=True))
+        for name, episodes in done.items():
+            k, before = self.names.index(name), around.before[starts]
+            self.cost[k, :, starts], self.second[k, :, starts] = episodes.cost + before, episodes.second + before
+            self.lost[k, :, starts] = episodes.lost
         return done
 
     def with_names(self, more: Sequence[str]) -> Trials:
@@ -95,6 +99,13 @@ class Trials:
         cost, second = (np.concatenate([costs, np.full(shape, np.nan)]) for costs in (self.cost, self.second))
         lost = np.concatenate([self.lost, np.zeros(shape, dtype=bool)])
         return replace(self, names=(*self.names, *more), cost=cost, second=second, lost=lost)
+
+    def judged_from(self, first: int) -> Trials:
+        """With the starts that were tried, of which those from some on had no part in the choice."""
+        count = int((~np.isnan(self.cost).all(axis=(0, 1))).sum())
+        kept: dict[str, Any] = {name: getattr(self, name)[..., :count] for name in ("cost", "second", "lost")}
+        kept |= {name: getattr(self, name)[:count] for name in ("rows", "returns", "begun")}
+        return replace(self, **kept, judged=np.arange(count) >= first)
 
     def of(self, name: str) -> Array:
         """The costs of a controller, ``(models, starts)``."""
@@ -108,15 +119,15 @@ class Trials:
     def improves(self, name: str) -> bool:
         """Whether it costs no more than MPC_1 on the median model, by both regressions.
 
-        From all starts; those that had no part in the choice may not say otherwise beyond a standard error. Where there
-        is no difference at all, what was identified predicts the log better, and is taken.
+        From all starts; those that had no part in the choice may not say otherwise beyond two standard errors.
+        Where there is no difference at all, what was identified predicts the log better, and is taken.
         """
         for second in (False, True):
             gains = self.differences(name, second=second)[self.votes]
             middle = int(np.argsort(gains.mean(axis=1), kind="stable")[len(gains) // 2])
             fresh = gains[middle][self.judged]
             error = fresh.std() / np.sqrt(len(fresh)) if len(fresh) else 0.0
-            if not gains[middle].mean() <= 0.0 or (len(fresh) and fresh.mean() > error):
+            if not gains[middle].mean() <= 0.0 or (len(fresh) and fresh.mean() > 2.0 * error):
                 return False
         return True
 
@@ -173,6 +184,10 @@ class Surroundings:
         n_steps: Their length.
         layout: Of the models' states.
         seed: Of the measurement noise.
+        spare: How many of the rows, the last ones, are for where the others decide nothing.
+        before: What the log cost from the begin of an episode to a row, ``(starts,)``, which is the same for every
+            controller; 0 by default.
+        n_before: In how many steps.
     """
 
     def __init__(
@@ -184,15 +199,20 @@ class Surroundings:
         n_steps: int,
         layout: Layout,
         seed: int = 0,
+        spare: int = 0,
+        before: Array | None = None,
+        n_before: int = 0,
     ) -> None:
         self.models, self.cost, self.rows, self.n_steps, self._layout = models, cost, rows, n_steps, layout
+        self.usual, self.n_before = len(rows) - spare, n_before
+        self.before = np.zeros(len(rows)) if before is None else before
         columns = table.values()
         self.starts = columns.observations[rows]
         self.signals = signals_along(table, rows, n_steps, layout)
         self.disturbances = models.replayed(table, rows, n_steps)
         rng = np.random.default_rng([seed, _NOISE])
         self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
-        self.returns = returns_along(table, rows, n_steps)
+        self.returns = returns_along(table, rows, n_steps) + self.before
         self.begun = np.isin(rows, table.episodes.firsts)
         states = columns.observations
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
@@ -200,44 +220,54 @@ class Surroundings:
         self._reach = np.where((spread > 0.0) & (np.arange(len(reach)) < layout.n_states), reach, np.inf)
         self._dearest = float(columns.costs.max())
 
-    def act(self, controller: Controller, starts: slice = slice(None)) -> Episodes:
-        """Closed loops of a controller on all models from all starts; all decisions of a step are one batch.
+    def act(self, controllers: Sequence[Controller], starts: slice = slice(None)) -> list[Episodes]:
+        """Closed loops of controllers on all models from all starts; all decisions of one in a step are one batch.
 
         A state that runs away stays where it was and costs as much as the dearest logged transition from then on; an
         episode that ends as those of the log do costs nothing more.
 
         Args:
-            controller: What acts.
+            controllers: What acts, each by itself.
             starts: From which starts; all by default.
         """
-        ny, n, m, begun = self._layout.ny, self._layout.n_states, len(self.models), self.starts[starts]
-        s, noise, disturbances = len(begun), self.noise[:, starts], self.disturbances[:, starts]
-        signals, x = self.signals[starts], np.broadcast_to(begun, (m, *begun.shape)).copy()
-        lost, over = np.zeros((m, s), dtype=bool), np.zeros((m, s), dtype=bool)
-        total, second, states, actions = np.zeros((m, s)), np.zeros((m, s)), [x[0].copy()], []
-        course: Any = None
-        mpc = getattr(controller, "mpc", None)
-        if mpc is not None and mpc.nx == x.shape[2] > ny:  # it knows what was applied before, as in midst of an episode
-            plan = Plan.none(m * s, mpc)
-            course = Course(plan.x, plan.u, x.reshape(m * s, -1)[:, ny:], plan.multipliers)
+        ny, n, m, c = self._layout.ny, self._layout.n_states, len(self.models), len(controllers)
+        begun, signals = self.starts[starts], self.signals[starts]
+        noise, disturbances = self.noise[:, starts], self.disturbances[:, starts]
+        shape = m, c, len(begun)  # a row of states for each
+        x = np.broadcast_to(begun, (*shape, begun.shape[1])).copy()
+        lost, over = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
+        courses = [self._course(controller, x[:, i]) for i, controller in enumerate(controllers)]
         for k in range(self.n_steps):
-            seen = x[:, :, :ny].copy()
-            seen[:, :, :n] += noise[k]
-            u, course = controller.predict(seen.reshape(m * s, ny), state=course)
-            u = np.asarray(u, dtype=np.float64)
-            flat = x.reshape(m * s, -1)
+            seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
+            seen[..., :n] += noise[k]
+            for i, controller in enumerate(controllers):
+                found, courses[i] = controller.predict(seen[:, i].reshape(-1, ny), state=courses[i])
+                u[:, i] = np.asarray(found, dtype=np.float64).reshape(m, len(begun), -1)
+            flat = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
             for costs, function in ((total, self.cost), (second, self.cost.second)):
-                stage = function(flat, u).reshape(m, s)
+                stage = function(*flat).reshape(shape)
                 costs += np.where(over, 0.0, np.where(lost, self._dearest, stage))
-            reached = self.models.step(x, u.reshape(m, s, -1))
-            reached[:, :, :n] += disturbances[:, :, k]
-            ended = self.cost.ended(flat, u, reached.reshape(m * s, -1)).reshape(m, s) & ~lost & ~over
+            reached = self.models.step(*(each.reshape(m, -1, each.shape[-1]) for each in (x, u))).reshape(x.shape)
+            reached[..., :n] += disturbances[:, None, :, k]
+            ended = self.cost.ended(*flat, reached.reshape(flat[0].shape)).reshape(shape) & ~lost & ~over
             total += np.where(ended, self.cost.end_price, 0.0)
             second += np.where(ended, self.cost.end_price, 0.0)
             over |= ended
-            lost |= ~(np.abs(reached - self._middle) < self._reach).all(axis=2) & ~over
-            x = np.where((lost | over)[:, :, None], x, reached)
-            x[:, :, n:ny] = signals[:, k]
+            lost |= ~(np.abs(reached - self._middle) < self._reach).all(axis=-1) & ~over
+            x = np.where((lost | over)[..., None], x, reached)
+            x[..., n:ny] = signals[:, k]
             states.append(x[0].copy())
-            actions.append(u.reshape(m, s, -1)[0])
-        return Episodes(total, second, lost | over, np.stack(states, axis=1), np.stack(actions, axis=1))
+            actions.append(u[0])
+        lost |= over
+        parts = np.stack(states, axis=2), np.stack(actions, axis=2)
+        return [Episodes(total[:, i], second[:, i], lost[:, i], *(each[i] for each in parts)) for i in range(c)]
+
+    def _course(self, controller: Controller, x: Array) -> Course | None:
+        """What a controller is given of the time before: the inputs that were applied, as in midst of an episode."""
+        mpc, ny = getattr(controller, "mpc", None), self._layout.ny
+        if mpc is None or not mpc.nx == x.shape[2] > ny:
+            return None
+        past = x.reshape(-1, x.shape[2])[:, ny:]
+        plan = Plan.none(len(past), mpc)
+        return Course(plan.x, plan.u, past, plan.multipliers)

@@ -94,7 +94,7 @@ class PlantFile:
         s, a, cost_, s_next, end, ids = map(np.array, rows.values())
         return TransitionTable.from_arrays(s, a, cost_, s_next, end, ids)
 
-    def closed_loops(self, controller: MPCPolicy | None, seed: int, n_starts: int) -> Loops:
+    def closed_loops(self, controller: MPCPolicy | None, seed: int, n_starts: int, *, logged: bool = False) -> Loops:
         """Episodes from starts that the log does not hold: the same starts for each controller of a seed.
 
         The plants move one after the other, the MPCs of all episodes that still run are solved in one batch.
@@ -103,8 +103,12 @@ class PlantFile:
             controller: A policy; None for the plant's own controllers, another one each episode.
             seed: Of the starts.
             n_starts: Number of episodes.
+            logged: Whether they begin as those of the log of this seed did, though they are disturbed otherwise; there
+                are no more than the log has.
         """
-        started = [self._started(np.random.default_rng([_STARTS + seed, e])) for e in range(n_starts)]
+        of = [_LOG, seed] if logged else [_STARTS + seed]
+        n_starts = min(n_starts, self.module.N_EPISODES) if logged else n_starts
+        started = [self._started(np.random.default_rng([*of, e])) for e in range(n_starts)]
         plants, observations = [plant for plant, _ in started], [observation for _, observation in started]
         act = self._behaviours(seed, n_starts) if controller is None else _Batched(controller)
         cost, running = np.zeros(n_starts), np.arange(n_starts)

@@ -84,6 +84,7 @@ class Outcome:
         verdict: That of ``diagnose`` on the learned MPC, where it was asked.
         reason: Its first reason.
         warned: 1 if it says that the learned MPC is worse, or rather worse, than what runs today; else 0.
+        from_log: Cost of the learned MPC from where the episodes of the log began, of which the verdict speaks.
         expected: What it expects an episode of the learned MPC to cost, where it simulates whole ones.
         lowest: The lowest that it expects.
         highest: The highest.
@@ -123,6 +124,7 @@ class Outcome:
     verdict: str = ""
     reason: str = ""
     warned: float = NAN
+    from_log: float = NAN
     expected: float = NAN
     lowest: float = NAN
     highest: float = NAN
@@ -241,6 +243,7 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
     found["full_over_behaviour"], _ = paired(full.cost, today.cost)
     if case.diagnose:
         tell("verdict")
+        found["from_log"] = float(plant.closed_loops(learner.policy, seed, n, logged=True).cost.mean())
         _judge(found, learner, whole, table, seed, plant.module.STEPS)
 
 

@@ -46,7 +46,7 @@ def summarised(outcomes: Sequence[Outcome]) -> Summary:
 _HEADER = ["plant", "seed", "behaviour", "MPC_1", "yardstick", "learned", "learned - MPC_1", "learned - yardstick"]
 _HEADER += ["ends well: MPC_1/yardstick/learned", "fit (s)", "build (s)", "learned - behaviour", "handed out"]
 _HEADER += ["full - MPC_1"]
-_OF_VERDICT = ["expected", "verdict", "verdict on full"]
+_OF_VERDICT = ["from the log's starts", "expected", "verdict", "verdict on full"]
 
 
 def report(outcomes: Sequence[Outcome]) -> str:
@@ -75,7 +75,7 @@ def report(outcomes: Sequence[Outcome]) -> str:
     judged = any(o.verdict for o in rows)
     header = _HEADER + _OF_VERDICT * judged
     cells = [_cells(o) + _verdict_cells(o) * judged for o in rows]
-    table = Table(header, cells, align="lrrrrrrrrrrrlr" + "rll" * judged)
+    table = Table(header, cells, align="lrrrrrrrrrrrlr" + "rrll" * judged)
     lines += ["", table.markdown(), "", *_sayings(rows)]
     return "\n".join(lines).rstrip("\n") + "\n"
 
@@ -121,7 +121,7 @@ def _of_verdicts(rows: Sequence[Outcome]) -> list[str]:
         return f"**{sum((o.full_warned if full else o.warned) > 0.0 for o in found)} of {len(found)}**"
 
     known = [o for o in rows if np.isfinite(o.expected)]
-    off = [abs(o.expected - o.learned) / abs(o.learned) for o in known]
+    off = [abs(o.expected - o.from_log) / abs(o.from_log) for o in known]
     lines = [
         f"* Recommended, but worse than MPC_1 by more than 2 %: {both(wrong)}",
         f"* Better than MPC_1 by more than 2 % and recommended: {both(right)}",
@@ -129,10 +129,11 @@ def _of_verdicts(rows: Sequence[Outcome]) -> list[str]:
         f"* Worse than these by more than 2 %, and the verdict says so: {both(warned)}",
     ]
     if off:
-        inside = sum(o.lowest <= o.learned <= o.highest for o in known)
+        inside = sum(o.lowest <= o.from_log <= o.highest for o in known)
         lines.append(
-            f"* Expected against true cost of what was handed out: median deviation **{np.median(off):.1%}**, 90 %"
-            f" within **{np.quantile(off, 0.9):.0%}**; within the report's own band {inside} of {len(known)}"
+            f"* Expected against true cost of what was handed out, from where episodes of the log began: median"
+            f" deviation **{np.median(off):.1%}**, 90 % within **{np.quantile(off, 0.9):.0%}**; within the report's own"
+            f" band {inside} of {len(known)}"
         )
     total = [o.fit_s + o.verdict_s for o in rows]
     return [*lines, f"* Time in s of one core: verdict {_range([o.verdict_s for o in rows])}; with fit {_range(total)}"]
@@ -164,7 +165,7 @@ def _cells(o: Outcome) -> list[str]:
 
 def _verdict_cells(o: Outcome) -> list[str]:
     band = "-" if np.isnan(o.expected) else f"{o.expected:.4g} ({o.lowest:.4g} to {o.highest:.4g})"
-    return [band, f"{o.verdict}: {o.reason}".rstrip(": ") or "-", o.full_verdict or "-"]
+    return [_number(o.from_log), band, f"{o.verdict}: {o.reason}".rstrip(": ") or "-", o.full_verdict or "-"]
 
 
 def _number(value: float) -> str:

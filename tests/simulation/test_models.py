@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import lq_plant
 import numpy as np
@@ -15,6 +17,8 @@ from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.estimation import identify
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC, Model, QuadraticCost
+from mpcoffline.mpc.integrators import Scheme
+from mpcoffline.simulation.members import finer
 from mpcoffline.simulation.models import STEPS, LogModels
 
 Array = NDArray[np.float64]
@@ -162,3 +166,29 @@ def test_a_model_that_is_not_finite_is_judged_and_stepped() -> None:
     models = LogModels.of(mpc, LOG, None, n_perturbed=2, n_residual=2)
     assert np.isfinite(models.replayed(LOG, np.array([0, 30]), 30)).all()
     assert len(models.votes) == len(models)
+
+
+def test_simulations_take_finer_steps_than_the_log_asks_for() -> None:
+    """Near rest x' = -x^3 is slow; from x = 8 one RK4 step of .1 blows up, the plant does not."""
+    model = Model(lambda x, u, _: -(x**3) + u, 1, 1, 0.1, {})
+    mpc = MPC(
+        model.with_scheme(Scheme("rk4")), QuadraticCost([[1.0]], [[1.0]]), QuadraticCost([[1.0]]), 5, 0.9, [-1.0], [1.0]
+    )
+    assert finer(mpc).model.scheme == Scheme("rk4", 4)
+    exact = 8.0 / np.sqrt(1.0 + 2.0 * 64.0 * 0.1)
+    assert abs(float(finer(mpc).model([8.0], [0.0])[0]) - exact) < 1.0 < abs(float(mpc.model([8.0], [0.0])[0]) - exact)
+    fixed = mpc.replace(model=Model(lambda x, u, _: -x + u * x, 1, 1, 0.1, {}, integrator="rk4"))
+    assert finer(fixed) is fixed
+    assert finer(lq_plant.make_mpc((lq_plant.A, lq_plant.B))).model.scheme is None
+
+
+def test_a_model_without_a_vote_is_not_asked_while_controllers_are_chosen() -> None:
+    models = replace(models_of(walk_mpc(0.0), walk_log(0.0, np.zeros((8, 20)))), names=("identified", "b", "c"))
+    models = replace(models, errors=np.array([0.5, 0.03, 0.03]), baseline=1.0, members=_Three())  # type: ignore[arg-type]
+    assert models.asked(2, identified=False).names == ("b", "c")
+    assert models.asked(2).names == ("identified", "b", "c")
+
+
+class _Three:
+    def some(self, kept: NDArray[np.bool_]) -> int:
+        return int(kept.sum())

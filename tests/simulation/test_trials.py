@@ -21,7 +21,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST, choose
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
-from mpcoffline.simulation.starts import initial_rows, returns_along
+from mpcoffline.simulation.starts import costs_before, initial_rows, returns_along
 from mpcoffline.simulation.trials import Surroundings, Trials
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ def place(mpc: MPC, log: TransitionTable, rows: list[int], n_steps: int, members
 
 def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     around = place(TRUE_MPC, LOG, [0, 30, 60, 90, 120], 40)
-    done = around.act(MPCPolicy(TRUE_MPC))
+    done = around.act([MPCPolicy(TRUE_MPC)])[0]
     x, expected = LOG.observations[[0, 30, 60, 90, 120]].astype(np.float64), np.zeros(5)
     for _ in range(40):
         u = x @ BEST.K.T
@@ -48,7 +48,7 @@ def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     np.testing.assert_allclose(done.second, done.cost)  # a quadratic is exact: there is no other opinion
     assert not done.lost.any()
     assert done.states.shape == (5, 41, 2)
-    some = around.act(MPCPolicy(TRUE_MPC), slice(1, 3))
+    some = around.act([MPCPolicy(TRUE_MPC)], slice(1, 3))[0]
     np.testing.assert_allclose(some.cost, done.cost[:, 1:3], rtol=1e-6)
 
 
@@ -73,7 +73,9 @@ def test_a_disturbance_of_the_log_meets_every_controller_again() -> None:
             self.k += 1
             return np.broadcast_to(action, (len(observation), 1)), None
 
-    np.testing.assert_allclose(around.act(Replay()).states[0, 1:], log.next_observations, atol=1e-2)  # but outliers
+    np.testing.assert_allclose(
+        around.act([Replay()])[0].states[0, 1:], log.next_observations, atol=1e-2
+    )  # but outliers
 
 
 def test_a_state_that_runs_away_is_lost_and_dear() -> None:
@@ -81,7 +83,7 @@ def test_a_state_that_runs_away_is_lost_and_dear() -> None:
     log = LOG.take(np.arange(60))
     around = place(unstable, log, [0, 30], 30)
     around.starts[1], around.disturbances[:] = 0.0, 0.0
-    done = around.act(MPCPolicy(TRUE_MPC))
+    done = around.act([MPCPolicy(TRUE_MPC)])[0]
     assert done.lost.tolist() == [[True, False]]
     assert done.cost[0, 0] > 10 * log.costs.max()
     assert np.isfinite(done.cost).all()
@@ -99,7 +101,7 @@ def test_past_inputs_that_the_log_hardly_varied_are_no_state_that_runs_away() ->
     log = with_memory(TransitionTable.from_arrays(*(np.array(part) for part in zip(*parts, strict=True))), mpc.layout)
     around = place(mpc, log, [0], 30)
     around.starts[:], around.disturbances[:] = [0.5, 0.1], 0.0
-    done = around.act(MPCPolicy(mpc))
+    done = around.act([MPCPolicy(mpc)])[0]
     assert done.actions.max() > 0.9
     assert not done.lost.any()
     assert done.states[0, -1, 0] == pytest.approx(3.0, abs=0.3)
@@ -108,6 +110,51 @@ def test_past_inputs_that_the_log_hardly_varied_are_no_state_that_runs_away() ->
 def test_starts_are_those_of_the_log() -> None:
     assert set(initial_rows(LOG, 12, 3)) <= set(range(0, 600, 30))
     assert len(initial_rows(LOG, 50, 0)) == 50  # more than there are episodes
+    rows = initial_rows(LOG, 12, 3, spare=30)
+    assert len(rows) == 42
+    assert set(range(0, 600, 30)) <= set(rows)  # all first ones before any other
+    assert len(set(rows)) == 42
+
+
+def test_further_starts_are_like_the_first_ones_and_no_runaway() -> None:
+    rng = np.random.default_rng(0)
+    first = rng.uniform(-1.0, 1.0, (40, 1))
+    states = first * 1.3 ** np.arange(12)  # an episode runs away, to 18 times where it began
+    log = TransitionTable.from_arrays(
+        states[:, :-1].reshape(-1, 1), np.zeros((440, 1)), np.zeros(440), states[:, 1:].reshape(-1, 1), np.zeros(440),
+        np.repeat(np.arange(40), 11),
+    )  # fmt: skip
+    rows = initial_rows(log, 40, 0, spare=100)
+    more = np.asarray(log.observations[rows[40:], 0])
+    assert np.abs(more).max() < 2.0
+    assert more.std() == pytest.approx(first.std(), rel=0.25)
+    assert len(set(rows)) == 140
+
+
+def test_episodes_cost_what_the_log_did_before_past_inputs_are_known() -> None:
+    layout = TRUE_MPC.with_delay(2).layout
+    table = with_memory(LOG, layout)
+    before = costs_before(LOG, table, np.array([0, 28, 30]), 2)
+    costs = LOG.values().costs
+    np.testing.assert_allclose(before, [costs[:2].sum(), costs[30:32].sum(), 0.0])
+    around = Surroundings(
+        place(TRUE_MPC, LOG, [0], 1).models, LoggedCost(LOG), LOG, np.array([0, 30]), 5, TRUE_MPC.layout,
+        before=before[:2], n_before=2,
+    )  # fmt: skip
+    plain = Surroundings(around.models, around.cost, LOG, np.array([0, 30]), 5, TRUE_MPC.layout)
+    trials = [Trials.none([FIRST], each) for each in (around, plain)]
+    for each, where in zip(trials, (around, plain), strict=True):
+        each.fill({FIRST: MPCPolicy(TRUE_MPC)}, where, slice(None))
+    np.testing.assert_allclose(trials[0].cost - trials[1].cost, np.broadcast_to(before[:2], (1, 1, 2)))
+    assert (trials[0].n_steps, trials[1].n_steps) == (7, 5)
+
+
+def test_controllers_together_do_what_each_does_alone() -> None:
+    around = place(TRUE_MPC, LOG, [0, 30, 60], 5, members=1)
+    other = MPCPolicy(TRUE_MPC.replace(action_high=[0.1], action_low=[-0.1]))
+    both = around.act([MPCPolicy(TRUE_MPC), other])
+    np.testing.assert_allclose(both[1].cost, around.act([other])[0].cost, rtol=1e-12)
+    assert (both[0].cost != both[1].cost).any()
 
 
 def test_what_the_log_cost_is_known_where_it_goes_on_or_ends_for_good() -> None:
@@ -121,11 +168,11 @@ def test_what_the_log_cost_is_known_where_it_goes_on_or_ends_for_good() -> None:
 
 def trials_of(gains: dict[str, float], votes: list[bool]) -> Trials:
     around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 5, members=len(votes) - 1)
-    empty = Trials.none([FIRST, *gains], around, judged=np.arange(20) >= 12)
+    empty = Trials.none([FIRST, *gains], around)
     rng = np.random.default_rng(0)
     common = rng.uniform(1.0, 2.0, empty.cost.shape[1:])
     cost = np.stack([common, *(common + gain for gain in gains.values())])
-    return replace(empty, cost=cost, second=cost.copy(), votes=np.array(votes))
+    return replace(empty, cost=cost, second=cost.copy(), votes=np.array(votes)).judged_from(12)
 
 
 def test_better_is_what_most_models_and_both_costs_say() -> None:

@@ -131,8 +131,8 @@ def test_verdicts_are_counted_against_the_truth() -> None:
         return outcome(100.0, learned, seed=seed, **(known | more))
 
     rows = [
-        judged(50.0, 120.0, 0, "recommend", "keep MPC_1", expected=52.0, lowest=45.0, highest=60.0),
-        judged(90.0, 90.0, 1, "try with care", "recommend", expected=80.0, lowest=70.0, highest=85.0),
+        judged(50.0, 120.0, 0, "recommend", "keep MPC_1", expected=52.0, from_log=50.0, lowest=45.0, highest=60.0),
+        judged(90.0, 90.0, 1, "try with care", "recommend", expected=80.0, from_log=90.0, lowest=70.0, highest=85.0),
         judged(105.0, 130.0, 2, "recommend", "recommend"),
         judged(120.0, 99.0, 3, "keep MPC_1", "keep MPC_1", warned=1.0),
     ]
