@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,6 +28,19 @@ def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
     store.mkdir(exist_ok=True)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(store))
     return store
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_lightly(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Solvers are compiled at -O1, in half the time; tests/solvers/ddp and tests/studies have them as shipped."""
+    build = sys.modules.get("mpcoffline.solvers.ddp.build")  # imported by whatever compiles, and by nothing else
+    if build is None or {"ddp", "studies"} & set(request.path.parts):
+        yield
+        return
+    from compiling import LIGHT_FLAGS, compiled_with
+
+    with compiled_with(LIGHT_FLAGS):
+        yield
 
 
 @pytest.fixture(autouse=True)

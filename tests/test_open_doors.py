@@ -187,7 +187,7 @@ def test_a_solver(add: Add, tmp_path: Path) -> None:
 def test_a_value_method(add: Add, tmp_path: Path) -> None:
     mine = add("outside_value", VALUE_METHOD, 10)
     for value in ("outside.huber", mine.Huber(0.5)):
-        learner = OfflineMPCLearner(problem(), value=value, **BRIEF)
+        learner = OfflineMPCLearner(problem(), value=value, candidate="full", **BRIEF)
         learner.fit(table(), show_progress=False)
         learner.save(tmp_path / "learner.zip")
         assert OfflineMPCLearner.load(tmp_path / "learner.zip").method == learner.method

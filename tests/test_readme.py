@@ -28,6 +28,7 @@ def test_the_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Whether learning succeeds is tested elsewhere; here it is brief.
     brief = PRESETS["default"].replaced({"value_n_steps": 200, "refit_rows": 2000, "terminal": "quadratic"})
     monkeypatch.setitem(PRESETS, "default", brief)
+    monkeypatch.setattr("mpcoffline.simulation.surroundings._MOST_STEPS", 20)
     names: dict[str, object] = {}
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import lq_plant
 import numpy as np
@@ -24,9 +25,10 @@ LOG = episodes(n=40, steps=40)
 WRONG = lq_plant.make_mpc((lq_plant.A, -0.5 * lq_plant.B))
 
 
-def fitted(mpc: MPC, table: TransitionTable = LOG) -> OfflineMPCLearner:
+def fitted(mpc: MPC, table: TransitionTable = LOG, candidate: str = "auto") -> OfflineMPCLearner:
+    options: dict[str, Any] = {"method": "bellman", "init": "identified", "fit_n_steps": 1, "trim": 1.0}
     value = QuadraticValue(lq_plant.BEST.P)
-    learner = OfflineMPCLearner(mpc, method="bellman", init="identified", value_function=value, fit_n_steps=1, trim=1.0)
+    learner = OfflineMPCLearner(mpc, value_function=value, candidate=candidate, **options)
     learner.fit(table, show_progress=False)
     return learner
 
@@ -68,12 +70,9 @@ def test_the_figure_is_drawn(good: Report, tmp_path: Path) -> None:
     files = good.figure(tmp_path / "report.png")
     assert [file.name for file in files] == ["report.pdf", "report.png"]
     assert all(file.stat().st_size > 10_000 for file in files)
-    again = good.figure(tmp_path / "again")
+    again = good.figure(tmp_path / "fit.0.95")
+    assert [file.name for file in again] == ["fit.0.95.pdf", "fit.0.95.png"]  # a point in its name begins no suffix
     assert again[0].read_bytes() == files[0].read_bytes()
-
-
-def test_a_point_in_the_figures_name_is_no_suffix(good: Report, tmp_path: Path) -> None:
-    assert [file.name for file in good.figure(tmp_path / "fit.0.95")] == ["fit.0.95.pdf", "fit.0.95.png"]
 
 
 def test_the_same_seed_gives_the_same_report(good: Report) -> None:
@@ -100,14 +99,14 @@ def test_a_dead_time_that_the_fit_found_is_known_to_the_diagnosis() -> None:
 
 def test_late_inputs_are_found() -> None:
     late = episodes(n=40, steps=40, lag=1)
-    report = diagnose(fitted(WRONG, late), late, n_starts=5, n_steps=30)
+    report = diagnose(fitted(WRONG, late, "full"), late, n_starts=5, n_steps=30)
     assert report.lag.found
 
 
 def test_noise_and_a_log_without_the_goal_are_noted() -> None:
     noisy = with_measurement_noise(LOG, 0.05, 0)
     far = WRONG.with_theta(WRONG.space.pack({"stage_cost.x_ref": [9.0, 0.0]}))
-    report = diagnose(fitted(far, noisy), noisy, n_starts=3, n_steps=10)
+    report = diagnose(fitted(far, noisy, "full"), noisy, n_starts=3, n_steps=10)
     assert report.noise.level == pytest.approx(0.05, rel=0.15)
     assert any("noise" in note for note in report.notes)
     assert any("never reaches the goal" in note for note in report.notes)
@@ -126,7 +125,7 @@ def test_a_short_single_episode_gives_a_report_without_nan() -> None:
 def test_what_cannot_be_diagnosed_is_refused() -> None:
     with pytest.raises(MPCOfflineError, match="fit"):
         diagnose(OfflineMPCLearner(WRONG, preset="paper"), LOG)
-    learner = fitted(WRONG)
+    learner = fitted(WRONG, candidate="full")
     with pytest.raises(UnknownIdError, match="'lag'"):
         diagnose(learner, LOG, rules=["lags"])
     with pytest.raises(InvalidArgumentError, match="n_starts"):
@@ -165,7 +164,7 @@ def test_a_swing_up_is_diagnosed() -> None:
     part = TransitionTable(table.rows[40_000:], table.ny, table.nu, table.episode_ids[40_000:])
     mpc = mpcoffline.nominal_mpc("mpcoffline/PendulumSwingUp-v0", alpha=1.5, seed=1)
     value = fit_value(part, 0.95, ValueConfig(method="expectile", n_steps=500), seed=0)
-    learner = OfflineMPCLearner(mpc, preset="default", terminal="quadratic", value_function=value)
+    learner = OfflineMPCLearner(mpc, preset="default", terminal="quadratic", value_function=value, candidate="full")
     learner.fit(part, show_progress=False)
     report = diagnose(learner, part)
     assert report.verdict == "recommend"

@@ -13,6 +13,7 @@ from mpcoffline.solvers.ddp import build
 
 STATE = [[1.5]]
 SHIPPED_FLAGS = build.FLAGS
+LIGHT_FLAGS = tuple("-O1" if flag == "-O3" else flag for flag in SHIPPED_FLAGS)
 QUICK_FLAGS = tuple("-O0" if flag == "-O3" else flag for flag in SHIPPED_FLAGS)
 
 

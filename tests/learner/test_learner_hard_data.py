@@ -17,8 +17,11 @@ from mpcoffline.plants.nominal import nominal_mpc
 PENDULUM = "mpcoffline/PendulumSwingUp-v0"
 
 
-def pendulum_log(n_episodes: int = 10, length: int = 50, seed: int = 0) -> TransitionTable:
-    """Random torques from random states; consecutive rows are consecutive steps."""
+def pendulum_log(n_episodes: int = 50, length: int = 10, seed: int = 0) -> TransitionTable:
+    """Random torques from random states; consecutive rows are consecutive steps.
+
+    Episodes are short, as the choice among candidates simulates as many steps.
+    """
     env, rng = PendulumSwingUpEnv(), np.random.default_rng(seed)
     s = np.stack([rng.uniform(-np.pi, np.pi, n_episodes), rng.uniform(-2, 2, n_episodes)], axis=1)
     columns: list[list[np.ndarray]] = [[], [], [], []]
@@ -53,11 +56,11 @@ def scale_costs(rows: np.ndarray) -> None:
 
 
 HARD = {
-    "one hundred transitions": lambda: pendulum_log(2),
-    "one trajectory": lambda: pendulum_log(1, 300),
+    "one hundred transitions": lambda: pendulum_log(10),
+    "one trajectory": lambda: pendulum_log(1, 100),
     "everything terminates": lambda: changed(pendulum_log(), terminate),
     "costs of a million, with an offset": lambda: changed(pendulum_log(), scale_costs),
-    "duplicated rows": lambda: TransitionTable.concat([pendulum_log(2)] * 5),
+    "duplicated rows": lambda: TransitionTable.concat([pendulum_log(10)] * 5),
 }
 
 

@@ -44,15 +44,24 @@ def at(x: list[float]) -> tuple[Array, Array]:
 
 
 POINTS = (np.random.default_rng(5).uniform(-1, 1, (300, 2)), np.random.default_rng(6).uniform(-1, 1, (300, 1)))
-KINKED, QUADRATIC = LoggedCost(log(kinked)), LoggedCost(log(quadratic, noise=0.03))
+
+
+@pytest.fixture(scope="module")
+def of_kinked() -> LoggedCost:
+    return LoggedCost(log(kinked))
+
+
+@pytest.fixture(scope="module")
+def of_quadratic() -> LoggedCost:
+    return LoggedCost(log(quadratic, noise=0.03))
 
 
 # ---------------------------------------------------------------- which regression
 
 
-def test_a_quadratic_under_noise_stays_one() -> None:
+def test_a_quadratic_under_noise_stays_one(of_quadratic: LoggedCost) -> None:
     """Networks would find structure in the noise."""
-    cost = QUADRATIC
+    cost = of_quadratic
     assert not cost.exact
     assert "a quadratic of states and inputs" in str(cost)
     for predicted in (cost(*POINTS), cost.second(*POINTS)):
@@ -60,13 +69,13 @@ def test_a_quadratic_under_noise_stays_one() -> None:
     assert not np.array_equal(cost(*POINTS), cost.second(*POINTS))
 
 
-def test_a_cost_with_kinks_is_a_network_and_so_is_the_check() -> None:
-    assert "a small network" in str(KINKED)
+def test_a_cost_with_kinks_is_a_network_and_so_is_the_check(of_kinked: LoggedCost) -> None:
+    assert "a small network" in str(of_kinked)
     spread = float(np.std(kinked(*POINTS)))
-    errors = [(f(*POINTS) - kinked(*POINTS)).std() / spread for f in (KINKED, KINKED.second)]
+    errors = [(f(*POINTS) - kinked(*POINTS)).std() / spread for f in (of_kinked, of_kinked.second)]
     assert max(errors) < 0.1
-    assert 1.0 - KINKED.r2 == pytest.approx(max(errors) ** 2, abs=0.01)
-    assert not np.array_equal(KINKED(*POINTS), KINKED.second(*POINTS))
+    assert 1.0 - of_kinked.r2 == pytest.approx(max(errors) ** 2, abs=0.01)
+    assert not np.array_equal(of_kinked(*POINTS), of_kinked.second(*POINTS))
 
 
 def test_what_the_successor_decides_is_its_mean() -> None:
@@ -124,16 +133,18 @@ def test_a_quadratic_that_predicts_outer_rows_from_inner_ones_is_believed_as_far
 
 @settings(max_examples=3, deadline=None, phases=[Phase.generate])
 @given(st.floats(1e-6, 1e6), st.floats(-1e3, 1e3))
-def test_an_affine_change_of_the_cost_changes_nothing_else(scale: float, offset: float) -> None:
+def test_an_affine_change_of_the_cost_changes_nothing_else(
+    of_quadratic: LoggedCost, scale: float, offset: float
+) -> None:
     """L -> a (L + b), up to the rounding of the table to float32."""
     changed = LoggedCost(log(lambda s, a: scale * (quadratic(s, a) + offset), noise=0.03))
-    np.testing.assert_allclose(changed(*POINTS) / scale - offset, QUADRATIC(*POINTS), atol=1e-4)
-    assert changed.r2 == pytest.approx(QUADRATIC.r2, abs=1e-5)
+    np.testing.assert_allclose(changed(*POINTS) / scale - offset, of_quadratic(*POINTS), atol=1e-4)
+    assert changed.r2 == pytest.approx(of_quadratic.r2, abs=1e-5)
 
 
-def test_another_unit_of_the_cost_changes_no_network() -> None:
+def test_another_unit_of_the_cost_changes_no_network(of_kinked: LoggedCost) -> None:
     changed = LoggedCost(log(lambda s, a: 1024.0 * kinked(s, a)))
-    for f, g in ((KINKED, changed), (KINKED.second, changed.second)):
+    for f, g in ((of_kinked, changed), (of_kinked.second, changed.second)):
         np.testing.assert_allclose(g(*POINTS), 1024.0 * f(*POINTS), rtol=1e-6, atol=1e-6)
 
 

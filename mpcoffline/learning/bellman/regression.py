@@ -14,6 +14,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.text import listed
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.learning.adam import STATE, Adam
 from mpcoffline.learning.stages import FitResult, KnownCost, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
@@ -25,8 +26,6 @@ from .equation import BellmanProblem, PredictionError
 from .refit import refit_cost
 
 _log = logging.getLogger(__name__)
-
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # Adam's state; it does not count steps that were skipped
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class ParameterTraining:
         z = torch.from_numpy(start)
         self._z = torch.minimum(torch.maximum(z, self._low), self._high).requires_grad_()
         self._result: FitResult | None = None
-        self._optimiser = torch.optim.Adam([self._z], lr=self.config.learning_rate)
+        self._optimiser = Adam([self._z], self.config.learning_rate)
 
     @property
     def theta(self) -> Array:
@@ -174,7 +173,7 @@ class ParameterTraining:
         """One step of Adam, projected onto the bounds; returns the regression error where it was finite."""
         config = self.config
         schedule = cosine(self.step, self._n_gradients) * 0.5**self.attempt
-        self._optimiser.param_groups[0]["lr"] = config.learning_rate * schedule
+        self._optimiser.learning_rate = config.learning_rate * schedule
         batch, theta = self._table.columns(next(self._batches)), self._coordinates.theta(self._z)
         error = self._problem.error(batch, theta)
         loss = error + config.prior * self._z.square().sum()
@@ -239,8 +238,8 @@ class ParameterTraining:
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         """What :meth:`restore` needs to go on bit for bit."""
         arrays = {"z": self._z.detach().numpy().copy(), "steps": np.array([self.attempt, self.step], dtype=np.float64)}
-        moments = self._optimiser.state[self._z]
-        return arrays | {name: moments[name].numpy().copy() for name in _MOMENTS if moments}
+        moments = self._optimiser.state.get(self._z, {})  # it does not count steps that were skipped
+        return arrays | {name: moment.numpy().copy() for name, moment in moments.items()}
 
     def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
         """Takes over a state from :meth:`to_arrays` of a training with the same arguments.
@@ -253,7 +252,7 @@ class ParameterTraining:
             if not (0 <= attempt <= self.config.n_restarts and 0 <= step <= self.n_steps):
                 raise ValueError(f"attempt {attempt}, step {step}")
             z = same_shape(arrays["z"], self._z)
-            kinds = {"step": torch.zeros(())} | dict.fromkeys(_MOMENTS[1:], self._z) if "exp_avg" in arrays else {}
+            kinds = {"step": torch.zeros(())} | dict.fromkeys(STATE[1:], self._z) if "exp_avg" in arrays else {}
             moments = {name: same_shape(arrays[name], kind) for name, kind in kinds.items()}
         except (KeyError, TypeError, ValueError) as error:
             raise FileFormatError(

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mpcoffline.datasets.table.transitions import Columns
+from mpcoffline.learning.adam import STATE, Adam
 
 from .methods import ValueMethod
-
-_ADAM = ("step", "exp_avg", "exp_avg_sq")
 
 
 class FlatNetwork:
@@ -146,7 +145,7 @@ class Member:
         start = [network.weights_of(net).to(device) for network, net in zip(networks, nets, strict=True)]
         self.critic = FlatCritic(networks, [weights.clone().requires_grad_() for weights in start])
         self.target = FlatCritic(networks, start, bounds)
-        self._optimiser = torch.optim.Adam(self.critic.weights, fused=True)
+        self._optimiser = Adam(self.critic.weights, fused=True)
 
     def descend(
         self, method: ValueMethod, batch: Columns, discount: float, learning_rate: float, polyak: float
@@ -162,7 +161,7 @@ class Member:
         steepness = sum(float(weights.grad.norm()) for weights in self.critic.weights if weights.grad is not None)
         if not math.isfinite(steepness):  # one NaN would stay in Adam's moments for ever
             return math.nan
-        self._optimiser.param_groups[0]["lr"] = learning_rate
+        self._optimiser.learning_rate = learning_rate
         self._optimiser.step()
         with torch.no_grad():
             for following, weights in zip(self.target.weights, self.critic.weights, strict=True):
@@ -178,7 +177,7 @@ class Member:
         """Weights, target and Adam's state."""
         arrays: dict[str, NDArray[Any]] = {}
         for i, (weights, target) in enumerate(zip(self.critic.weights, self.target.weights, strict=True)):
-            tensors = {"weights": weights, "target": target, **self._optimiser.state[weights]}
+            tensors = {"weights": weights, "target": target, **self._optimiser.state.get(weights, {})}
             arrays |= {f"{i}.{name}": tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
         return arrays
 
@@ -196,7 +195,7 @@ class Member:
             if f"{i}.step" in arrays:
                 step = torch.zeros((), device=weights.device)
                 self._optimiser.state[weights] = {
-                    name: same_shape(arrays[f"{i}.{name}"], step if name == "step" else weights) for name in _ADAM
+                    name: same_shape(arrays[f"{i}.{name}"], step if name == "step" else weights) for name in STATE
                 }
 
 

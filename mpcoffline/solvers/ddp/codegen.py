@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import resources
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,6 +26,9 @@ _LARGEST_BENT = 2000  # nodes of a model whose second derivatives are taken: the
 _ATTRIBUTES = {"gen_q": "NOINLINE "}
 # What is emitted of a model with layers instead: the rest of the functions, which are composed of it and the layers.
 _WITH_LAYERS = {"gen_step": "gen_cost", "gen_q": "gen_q_of_model"}
+# What was generated last, by what it was generated from: the MPCs of a fit differ in theta, bounds and horizon, mostly.
+_KNOWN: dict[tuple[object, ...], str] = {}
+_MOST_KNOWN = 32
 
 
 def source(mpc: MPC) -> str:
@@ -51,12 +55,53 @@ def generated(mpc: MPC) -> str:
     Raises:
         InvalidArgumentError: If a function of the MPC cannot be expanded to SX or has no counterpart in C.
     """
-    x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
+    problem = _Problem.of(mpc)
+    key = problem.key
+    code = _KNOWN.pop(key, None) or _generated(mpc, problem)
+    _KNOWN[key] = code  # as the last one
+    for oldest in list(_KNOWN)[:-_MOST_KNOWN]:
+        _KNOWN.pop(oldest, None)
+    return code
+
+
+class _Problem(NamedTuple):
+    """All of an MPC that C is generated from: expressions in x, u and theta, and what its costs promise."""
+
+    x: ca.SX
+    u: ca.SX
+    theta: ca.SX
+    reached: ca.SX
+    cost: ca.SX
+    final: ca.SX
+    kept: Limits | None
+    convex: tuple[bool, bool]
+
+    @classmethod
+    def of(cls, mpc: MPC) -> _Problem:
+        """Of an MPC."""
+        x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
+        reached, (cost, final, *_) = mpc.dynamics_function(x, u, theta), costs_of(mpc, x, u, theta)
+        convex = promises_convexity(mpc.stage_cost), promises_convexity(mpc.terminal_cost)
+        return cls(x, u, theta, reached, cost, final, limits_of(mpc, x, u, theta), convex)
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Equal for problems of which the same C is generated."""
+        outputs: list[ca.SX] = [self.reached, self.cost, self.final]
+        others: tuple[object, ...] = ()
+        if self.kept is not None:
+            outputs += [self.kept.stage, self.kept.end]
+            numbers = self.kept.l1, self.kept.l2, self.kept.by_input
+            others = (self.kept.n_stage, *(array.tobytes() for array in numbers))
+        return ca.Function("problem", [self.x, self.u, self.theta], outputs).serialize(), self.convex, others
+
+
+def _generated(mpc: MPC, problem: _Problem) -> str:
+    """See :func:`generated`."""
+    x, u, theta, reached, cost, final, kept, promised = problem
     following, gradient = ca.SX.sym("following", mpc.nx), ca.SX.sym("Vx", mpc.nx)
     curvature, discount = ca.SX.sym("Vxx", mpc.nx * (mpc.nx + 1) // 2), ca.SX.sym("discount")
     z = ca.vertcat(x, u)
-    reached = mpc.dynamics_function(x, u, theta)
-    cost, final, *_ = costs_of(mpc, x, u, theta)
     layers = _layers(mpc, theta) if ca.n_nodes(reached) > _LARGEST_BENT else None
     _check_size(mpc, ca.vertcat(cost, final), layers.n_scalars if layers else ca.n_nodes(reached))
     final_hessian, final_gradient = ca.hessian(final, x)
@@ -75,7 +120,7 @@ def generated(mpc: MPC) -> str:
         "gen_final_expand": _stacked(final_gradient, _triangle(final_hessian)),
     }
     exact = not hessian[: mpc.nx, : mpc.nx].nnz() and ca.n_nodes(reached) <= _LARGEST_BENT
-    as_is = exact or promises_convexity(mpc.stage_cost)
+    as_is = exact or promised[0]
     if not as_is:  # gen_q takes the expansion as the kernel changed it
         inputs["gen_stage_expand"], outputs["gen_stage_expand"] = [x, u], _stacked(slope, _triangle(hessian))
         stage = ca.SX.sym("stage", outputs["gen_stage_expand"].numel())
@@ -87,13 +132,12 @@ def generated(mpc: MPC) -> str:
         inputs["gen_q"].append(array)
         inputs |= {name: [read] for name, (read, _) in layers.functions.items()}
         outputs |= {name: given for name, (_, given) in layers.functions.items()}
-    kept = limits_of(mpc, x, u, theta)
     if kept is not None:
         for name, (read, given) in limit_functions(kept, x, u).items():
             inputs[name], outputs[name] = read, given
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
-    convex = int(as_is), int(promises_convexity(mpc.terminal_cost))
+    convex = int(as_is), int(promised[1])
     names = {} if layers is None else _WITH_LAYERS
     parts = [
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",

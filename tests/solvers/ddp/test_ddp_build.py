@@ -14,10 +14,10 @@ import pytest
 from compiling import QUICK_FLAGS, STATE, compiled_with, compiler_script, libraries, tiny
 from mpc_problems import random_linear
 
-from mpcoffline.mpc import Model, NetworkCost
+from mpcoffline.mpc import Constraint, Model, NetworkCost, NormCost, Penalty
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import CompilerError, DDPSolver, make_solver
-from mpcoffline.solvers.ddp import build
+from mpcoffline.solvers.ddp import build, codegen
 from mpcoffline.solvers.ddp.codegen import source
 
 
@@ -254,6 +254,29 @@ def test_sanitizers_find_nothing(case: str, tmp_path: Path) -> None:
     done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 50
+
+
+def test_what_is_generated_again_is_what_was_generated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MPCs that differ in theta, bounds or horizon share their C; any other difference is one of the C, too."""
+    monkeypatch.setattr(codegen, "_KNOWN", {})
+    mpc, price = tiny(), Penalty(2.0, 3.0)
+    limited = mpc.replace(constraints=Constraint(lambda x, u, p: x + u - 1.0, "limit", price))
+    others = [
+        tiny(factor=0.5),
+        mpc.replace(terminal_cost=NormCost([0.0])),
+        limited,
+        limited.replace(constraints=Constraint(lambda x, u, p: x + u - 1.0, "limit", Penalty(2.0, 4.0))),
+        limited.replace(constraints=Constraint(lambda x, u, p: x - u - 1.0, "limit", price)),
+    ]
+    first = [source(each) for each in (mpc, *others)]
+    assert len(set(first)) == len(first)
+    same = mpc.replace(horizon=9, action_low=[-3.0]).with_theta(1.5 * mpc.theta)
+    assert source(same) == first[0]
+    monkeypatch.setattr(codegen, "_generated", None)  # nothing more is generated
+    assert [source(each) for each in (same, *others)] == first
+    monkeypatch.undo()
+    monkeypatch.setattr(codegen, "_KNOWN", {})
+    assert [source(each) for each in (same, *others)] == first
 
 
 def test_warnings_of_the_compiler(tmp_path: Path) -> None:
