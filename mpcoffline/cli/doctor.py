@@ -20,6 +20,7 @@ Status = Literal["ok", "warn", "fail"]
 #: Optional packages, and what they are for.
 _OPTIONAL = {
     "pygame": ("pictures and films of the environments", "render"),
+    "cma": ("learn --polish", "polish"),
     "tensorboard": ("learn --tensorboard", "tensorboard"),
     "huggingface_hub": ("data sets on hf://", "hub"),
     "google-cloud-storage": ("data sets on gcp://", "gcs"),

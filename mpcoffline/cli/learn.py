@@ -91,6 +91,13 @@ def learn(
             "is; or another candidate by name."
         ),
     ] = "auto",
+    polish: Annotated[
+        bool,
+        typer.Option(
+            "--polish",
+            help="Move the best candidate's weights, too, by what closed loops cost; needs mpcoffline[polish].",
+        ),
+    ] = False,
     seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="Where to save the learner.", dir_okay=False)] = Path("learner.zip"),
     checkpoint: Annotated[
@@ -125,6 +132,7 @@ def learn(
         seed,
         value=value,
         candidate=candidate,
+        polish=polish,
         **{name: number for name, number in overrides.items() if number is not None},
     )
     begin = time.perf_counter()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,15 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy
+from mpcoffline.simulation.polishing import polished
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
+
+if TYPE_CHECKING:
+    from mpcoffline.core.progress import Bars
+
+    from .learner import OfflineMPCLearner
+    from .run import Run
 
 FULL = "full"
 TRIALS = "trials/"  # in front of the names of their arrays in a file
@@ -138,6 +146,22 @@ class Candidates(Mapping[str, MPC]):
         return cls(mpcs, chosen, trials)
 
 
+def candidates_of(learner: OfflineMPCLearner, run: Run, table: TransitionTable, bars: Bars) -> Candidates | None:
+    """What a learner could hand out at the end of a run, and what it does; None where that is the whole fit alone.
+
+    Raises:
+        UnknownIdError: If it was asked for a candidate that there is none of.
+    """
+    known, nominal = run.known, learner.nominal_mpc
+    between = {} if learner.candidate == FULL else run.method.candidates(known)
+    if learner.candidate == "auto":
+        show, variants = partial(bars.show, "choosing on models of the log"), partial(run.method.variants, known)
+        return tried(nominal, known, between, table, variants, show, polish=learner.polish) if between else None
+    found = Candidates({FIRST: nominal, **between, FULL: known.mpc}, learner.candidate)
+    _ = found.mpc  # refuses a name that is none of them
+    return None if learner.candidate == FULL else found
+
+
 def tried(
     nominal: MPC,
     known: Known,
@@ -145,6 +169,8 @@ def tried(
     table: TransitionTable,
     variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]],
     tell: Callable[[int, int, str], None],
+    *,
+    polish: bool = False,
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -155,6 +181,7 @@ def tried(
         table: The transitions as they were logged.
         variants: Of good ones.
         tell: Is told how many starts of how many are done, and what is tried.
+        polish: Whether the best one's weights are moved by what closed loops cost.
     """
     mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
     if known.found is None:
@@ -162,6 +189,13 @@ def tried(
     slow = are_slow(quick_policy(mpc) for mpc in (nominal, known.mpc))
     around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
+    if polish:
+        better, name = polished(mpcs[chosen], around, known.seed, tell), f"{chosen}, polished"
+        logger.log(logging.INFO if better.taken else logging.WARNING, "%s: %s", chosen, better.reason)
+        if better.taken:
+            mpcs, trials = {**mpcs, name: better.mpc}, trials.with_names([name])
+            trials.fill({name: quick_policy(better.mpc)}, around, slice(0, len(trials.rows)))
+            chosen = name if trials.improves(name) else chosen
     found = Candidates(mpcs, chosen, trials)
     if chosen == FIRST:
         logger.warning("%s\n%s", found.finding, found)

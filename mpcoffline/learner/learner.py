@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,9 +21,8 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.choice import FIRST
 
-from .candidates import FULL, TRIALS, Candidates, tried
+from .candidates import FULL, TRIALS, Candidates, candidates_of
 from .checkpoint import Checkpoint, History, history_from_json
 from .findings import findings
 from .presets import PRESETS
@@ -75,6 +73,8 @@ class OfflineMPCLearner:
         candidate: Which of the ``candidates`` is handed out. ``"auto"`` tries them on models of the log and takes
             the best, MPC_1 where none is better; that solves MPCs, learning does not. ``"full"``, or another name,
             takes that one and tries nothing. The paper's preset has no others than the whole fit.
+        polish: Whether weights of the best candidate are moved, too, by what closed loops on models of the log cost
+            (:func:`~mpcoffline.simulation.polishing.polished`); needs ``pip install "mpcoffline[polish]"``.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
@@ -94,6 +94,7 @@ class OfflineMPCLearner:
         method: The learning method with its options.
         preset: The name of the preset; None where a method was given.
         candidate: As given.
+        polish: As given.
         candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
             where the method knows of none but the whole fit.
     """
@@ -106,6 +107,7 @@ class OfflineMPCLearner:
         seed: int = 0,
         *,
         candidate: str = "auto",
+        polish: bool = False,
         method: str | Method | None = None,
         value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
@@ -132,7 +134,7 @@ class OfflineMPCLearner:
             )
         self.method = method.replaced(options)
         self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
-        self.candidate = check_name("candidate", candidate)
+        self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
         self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
@@ -263,21 +265,9 @@ class OfflineMPCLearner:
                 if any(_asks_to_end(answer) for answer in answers):
                     break
             if run.learned is not None:
-                self.candidates = self._candidates(run, table, bars)
+                self.candidates = candidates_of(self, run, table, bars)
                 self._policy = None
             self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
-
-    def _candidates(self, run: Run, table: TransitionTable, bars: Bars) -> Candidates | None:
-        """What could be handed out; None where that is the whole fit alone."""
-        known = run.known
-        between = {} if self.candidate == FULL else run.method.candidates(known)
-        if self.candidate == "auto":
-            show = partial(bars.show, "choosing on models of the log")
-            variants = partial(run.method.variants, known)
-            return tried(self.nominal_mpc, known, between, table, variants, show) if between else None
-        found = Candidates({FIRST: self.nominal_mpc, **between, FULL: known.mpc}, self.candidate)
-        _ = found.mpc  # refuses a name that is none of them
-        return None if self.candidate == FULL else found
 
     @property
     def mpc(self) -> MPC:
@@ -345,6 +335,7 @@ class OfflineMPCLearner:
             "history": self.history,
             "result": None if self.result is None else self.result.to_json(),
             "candidate": self.candidate,
+            "polish": self.polish,
             "candidates": None if self.candidates is None else self.candidates.to_json(),
             "observation_space": None if space is None else box_to_json(space),
         }
@@ -373,6 +364,7 @@ class OfflineMPCLearner:
             if document["learned"] is not None:
                 learner._mpc = MPC.from_json(document["learned"])
             learner.candidate = check_name("candidate", document["candidate"], error=FileFormatError)
+            learner.polish = document["polish"] is True
             if document["candidates"] is not None:
                 learner.candidates = Candidates.from_files(document["candidates"], arrays)
             if document["result"] is not None:

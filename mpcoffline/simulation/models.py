@@ -152,6 +152,11 @@ class LogModels:
         kept, best = self.votes, np.argsort(self.errors, kind="stable")
         kept[best[len(best) if most is None else most :]] = False
         kept[0] |= identified or not kept.any()
+        return self.some(np.flatnonzero(kept))
+
+    def some(self, numbers: NDArray[np.intp]) -> LogModels:
+        """Some of them, by number, in their order."""
+        kept = np.isin(np.arange(len(self)), numbers)
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
         return replace(self, names=names, errors=self.errors[kept], members=self.members.some(kept))
 

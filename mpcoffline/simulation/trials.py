@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -219,6 +220,12 @@ class Surroundings:
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
         self._reach = np.where((spread > 0.0) & (np.arange(len(reach)) < layout.n_states), reach, np.inf)
         self._dearest = float(columns.costs.max())
+
+    def on(self, models: NDArray[np.intp]) -> Surroundings:
+        """The same with some of the models, by number."""
+        other = copy.copy(self)
+        other.models, other.disturbances = self.models.some(models), self.disturbances[models]
+        return other
 
     def act(self, controllers: Sequence[Controller], starts: slice = slice(None)) -> list[Episodes]:
         """Closed loops of controllers on all models from all starts; all decisions of one in a step are one batch.

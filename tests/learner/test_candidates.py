@@ -15,6 +15,7 @@ from mpcoffline.core.errors import FileFormatError, UnknownIdError
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST
+from mpcoffline.simulation.polishing import Polished
 
 QUICK: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "quadratic", "seed": 0}
 LOG = episodes(n=40, steps=30)
@@ -110,6 +111,29 @@ def test_the_same_seed_chooses_the_same(plain: OfflineMPCLearner) -> None:
     assert second.trials is not None
     assert first.chosen == second.chosen
     np.testing.assert_array_equal(first.trials.cost, second.trials.cost)
+
+
+def test_the_best_one_may_be_polished(
+    plain: OfflineMPCLearner, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """The search itself has its own tests."""
+    mpcs: list[MPC] = []
+
+    def search(mpc: MPC, *_: Any) -> Polished:
+        mpcs.append(mpc)
+        return Polished(mpc.replace(horizon=mpc.horizon + 1), len(mpcs) == 1, 0.1, 0.01, 8, "not polished: why")
+
+    monkeypatch.setattr("mpcoffline.learner.candidates.polished", search)
+    learner = fitted(polish=True)
+    assert learner.candidates is not None
+    assert learner.candidates.chosen == f"{plain.candidates.chosen}, polished"  # type: ignore[union-attr]
+    assert learner.mpc.horizon == mpcs[0].horizon + 1
+    learner.save(tmp_path / "l.zip")
+    assert OfflineMPCLearner.load(tmp_path / "l.zip").polish
+    again = fitted(polish=True)
+    assert again.candidates is not None
+    assert again.candidates.chosen == plain.candidates.chosen  # type: ignore[union-attr]
+    assert "not polished: why" in caplog.text
 
 
 def test_a_fit_that_a_callback_ends_chooses_too() -> None:

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from compiling import LIGHT_FLAGS, compiled_with
 from scipy.optimize import minimize
 
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers import DDPSolver
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_lightly() -> Iterator[None]:
+    """Here, too: corners are a matter of the models and of the rounded ones, whatever the compiler makes of them."""
+    with compiled_with(LIGHT_FLAGS):
+        yield
 
 
 def tank(x: Any, u: Any, p: Any) -> Any:
