@@ -209,14 +209,20 @@ def as_logged(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> Trans
     Returns:
         The table itself where costs tell nothing.
     """
+    taken = as_applied(mpc, table, cost)
+    return table if taken.all() else table.take(np.flatnonzero(taken))
+
+
+def as_applied(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> NDArray[np.bool_]:
+    """Which rows these are, ``(n,)``; all, where costs tell nothing."""
     if cost is None or cost.agreeing == 1.0:
-        return table
+        return np.ones(len(table), dtype=bool)
     agreeing = []
     for start in range(0, len(table), _CHUNK):
         rows = table.take(slice(start, start + _CHUNK)).values()
         ours = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full().ravel()
         agreeing.append(np.abs(rows.costs - cost.scale * ours - cost.offset) <= cost.tolerance)
-    return table.take(np.flatnonzero(np.concatenate(agreeing)))
+    return np.concatenate(agreeing)
 
 
 def identify_as_logged(

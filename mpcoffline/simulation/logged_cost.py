@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.known_cost import COST_ROWS, ROUNDING, agreeing_cost
+from mpcoffline.learning.known_cost import COST_ROWS, ROUNDING, agreeing_cost, as_applied
 from mpcoffline.learning.stages import KnownCost
 from mpcoffline.mpc import MPC
 
@@ -58,8 +58,10 @@ class LoggedCost:
         table = table if logged is None else logged
         self._seen = table.ny if seen is None else seen
         agreeing = None if mpc is None else _agreeing(mpc, excerpt(table, COST_ROWS, seed))
-        self._mpc: MPC | None = None if agreeing is None else agreeing[0]
-        self.known: KnownCost | None = None if agreeing is None else agreeing[1]
+        self._partly = agreeing
+        whole = agreeing is not None and agreeing[1].agreeing == 1.0
+        self._mpc: MPC | None = agreeing[0] if agreeing is not None and whole else None
+        self.known: KnownCost | None = agreeing[1] if agreeing is not None and whole else None
         over = np.asarray(table.terminations) > 0.0
         going = table.take(np.flatnonzero(~over)) if over.any() and not over.all() else table
         rows = going.take(_some(len(going), seed))
@@ -91,6 +93,15 @@ class LoggedCost:
         if self.exact and (self.known is None or self.known.missed <= ROUNDING):
             return self(s, a)
         return self._other(np.hstack([s[:, : self._seen], a]))
+
+    def as_applied(self, table: TransitionTable) -> NDArray[np.bool_]:
+        """In which rows of a table the plant took the logged input, as far as the costs tell, ``(n,)``.
+
+        See :func:`~mpcoffline.learning.known_cost.as_logged`.
+        """
+        if self._partly is None:
+            return np.ones(len(table), dtype=bool)
+        return as_applied(self._partly[0], table, self._partly[1])
 
     def ended(self, s: Array, a: Array, reached: Array) -> NDArray[np.bool_]:
         """Whether steps from s ``(B, nx)`` under a ``(B, nu)`` to ``reached`` end an episode, ``(B,)``.
@@ -125,9 +136,9 @@ class LoggedCost:
 
 
 def _agreeing(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | None:
-    """The MPC whose stage cost agrees with all logged costs, if there is one."""
+    """The MPC whose stage cost agrees with the logged costs, all of them or a part, if there is one."""
     found = agreeing_cost(mpc, table, count=_FEW)
-    return None if found is None or found[1].constant or found[1].agreeing < 1.0 else found
+    return None if found is None or found[1].constant else found
 
 
 def _share(r2: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,7 @@ NEGLIGIBLE = 0.02  # spreads: of errors below, none is better than another
 _EXCERPT = 20_000  # rows that models are learned from and judged on
 _ROWS = 3_000  # that say what an outlier is
 _WINDOWS = 400
+_FEWEST = 10  # that are enough to judge by
 _STARTS = 3  # windows begin so many times a length
 _DIVERGED = 1e2  # spreads
 _LOST = 0.05  # share of the windows that diverge, from which on a model does
@@ -84,6 +86,7 @@ class LogModels:
         seed: int = 0,
         n_perturbed: int = 5,
         n_residual: int = 5,
+        believed: Callable[[TransitionTable], NDArray[np.bool_]] | None = None,
     ) -> LogModels:
         """Builds the members and judges them.
 
@@ -94,6 +97,8 @@ class LogModels:
             seed: Seeds draws and networks.
             n_perturbed: Number of moved models; none for a model without parameters.
             n_residual: Number of models with networks; none where the identified one misses nothing.
+            believed: Tells the rows of a table in which the plant took the logged input: where it cut that off, a model
+                would learn an input that does less than it does. All by default.
 
         Raises:
             InvalidDataError: If the data have other dimensions than the MPC.
@@ -105,9 +110,11 @@ class LogModels:
         problem, unwrapped = _problem(mpc, rows.take(free))
         x, u, reached = problem.rows
         invariants = Invariants.of(x, u, lambda x, u: problem.model.predict(x, u, mpc.theta), seed)
-        stops = Stops.of(x, reached, problem.model.predict(x, u, mpc.theta))
-        if (stopped := stops.hit(reached)).any():  # what happens there is no model's business
-            free = free[~stopped]
+        usable = np.ones(len(states), dtype=bool) if believed is None else believed(states)
+        stops = Stops.of(x, reached, problem.model.predict(x, u, mpc.theta), ~usable[free])
+        fitting = usable[free] & ~stops.hit(reached)  # what happens at a stop is no model's business
+        if not fitting.all() and fitting.any():
+            free = free[fitting]
             problem = _problem(mpc, rows.take(free))[0]
         used = rows.take(free)
         thetas = [mpc.theta, *moved_parameters(problem, used, n_perturbed, rng)]
@@ -117,7 +124,7 @@ class LogModels:
         names += [f"residual {i}" for i in range(1, len(networks) + 1)]
         maps = np.stack([*thetas, *[mpc.theta] * len(networks)])
         members = Members(mpc, maps, networks, (invariants.projected, stops.kept))
-        errors, baseline = _judged(mpc, members, rows, held_out, unwrapped)
+        errors, baseline = _judged(mpc, members, rows, held_out & usable, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
         if known is not None and not known.negligible:
@@ -171,7 +178,13 @@ class LogModels:
             reached[..., angles] = begin + np.mod(reached[..., angles] - begin, FULL_TURN)
         return self.layout.joined(reached, x, u)
 
-    def replayed(self, table: TransitionTable, rows: NDArray[np.intp], n_steps: int) -> Array:
+    def replayed(
+        self,
+        table: TransitionTable,
+        rows: NDArray[np.intp],
+        n_steps: int,
+        believed: Callable[[TransitionTable], NDArray[np.bool_]] | None = None,
+    ) -> Array:
         """What each member missed in the logged steps from some rows on: added after :meth:`step`, it replays them.
 
         These are the disturbances that nobody measured, under which the controllers are compared, if the model is
@@ -181,18 +194,23 @@ class LogModels:
         Args:
             table: The transitions of the MPC's states.
             rows: Where the stretches begin, ``(s,)``.
-            n_steps: Their length; 0 where an episode ends before, or the model's prediction is not finite.
+            n_steps: Their length.
+            believed: As in :meth:`of`.
 
         Returns:
-            Errors of the plant's states, ``(m, s, n_steps, n_states)``.
+            Errors of the plant's states, ``(m, s, n_steps, n_states)``; 0 where an episode ends before, the model's
+            prediction is not finite, or a row is not believed.
         """
         ids, length = table.episode_ids, len(table)
         steps = np.asarray(rows)[:, None] + np.arange(n_steps)
         inside = np.minimum(steps, length - 1)
         goes_on = (steps < length) & (ids[inside] == ids[np.asarray(rows)][:, None])
         needed, where = np.unique(inside, return_inverse=True)
-        missed = self._missed(table.take(needed))
-        limit = np.quantile(np.abs(self._missed(table.sample(_ROWS, 0))), _CLIPPED, axis=1, keepdims=True)
+        missed, some = self._missed(table.take(needed)), table.sample(_ROWS, 0)
+        if believed is not None:
+            missed[:, ~believed(table.take(needed))] = 0.0
+            some = some.take(np.flatnonzero(kept)) if (kept := believed(some)).any() else some
+        limit = np.quantile(np.abs(self._missed(some)), _CLIPPED, axis=1, keepdims=True)
         missed = np.clip(missed, -limit, limit)[:, where.reshape(inside.shape)]
         return np.where(goes_on[:, :, None], missed, 0.0)
 
@@ -217,11 +235,17 @@ def _problem(mpc: MPC, table: TransitionTable) -> tuple[OneStepProblem, tuple[in
 
 
 def _judged(
-    mpc: MPC, members: Members, table: TransitionTable, held_out: NDArray[np.bool_], unwrapped: tuple[int, ...]
+    mpc: MPC, members: Members, table: TransitionTable, judging: NDArray[np.bool_], unwrapped: tuple[int, ...]
 ) -> tuple[Array, float]:
-    """Errors of the members open loop, ``(m,)``, and of the best that knows no physics."""
-    found = Trajectories.of(mpc, table.take(np.flatnonzero(held_out)), unwrapped)
-    steps = min(STEPS, int(found.valid.sum(axis=1).max()))
+    """Errors of the members open loop on some rows, ``(m,)``, and of the best that knows no physics.
+
+    Over fewer steps where hardly any stretch of these rows is as long.
+    """
+    found = Trajectories.of(mpc, table.take(np.flatnonzero(judging)), unwrapped)
+    lengths = found.valid.sum(axis=1)
+    ahead = np.arange(1, min(STEPS, int(lengths.max())) + 1)
+    many = np.maximum(lengths - ahead[:, None] + 1, 0).sum(axis=1) >= _FEWEST
+    steps = int(ahead[many][-1]) if many.any() else int(ahead[-1])
     windows = Windows.of(found, steps, max(1, steps // _STARTS), full=True)
     if len(windows) > _WINDOWS:
         windows = windows.chosen(np.linspace(0, len(windows) - 1, _WINDOWS).astype(np.intp))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 
 _DIGITS = 1e-6  # of a state's range: rows nearer to its end than this are on it
+_NEARLY = 0.01  # likewise, where something is known to have stopped it
 _FEWEST = 3  # rows that say so: no two of a state that moves freely are alike
 _BEYOND = 0.01  # of the increments' spread that the model would have gone farther there, in the median
 
@@ -26,13 +27,15 @@ class Stops(NamedTuple):
     high: Array
 
     @classmethod
-    def of(cls, x: Array, reached: Array, predicted: Array) -> Self:
+    def of(cls, x: Array, reached: Array, predicted: Array, cut: NDArray[np.bool_] | None = None) -> Self:
         """Finds them.
 
         Args:
             x: Logged states, ``(N, n)``.
             reached: Their successors.
             predicted: What the identified model predicts for these.
+            cut: In which rows the plant is known to have cut off the input, ``(N,)``: of these, hitting an end nearly
+                will do, as of a full tank that leaks.
         """
         n = x.shape[1]
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
@@ -42,7 +45,8 @@ class Stops(NamedTuple):
         increments = (reached - x).std(axis=0)
         for k in range(n):
             for ends, end, sign in ((low, least[k], -1.0), (high, most[k], 1.0)):
-                there = sign * (end - reached[:, k]) <= _DIGITS * (most[k] - least[k])
+                off = sign * (end - reached[:, k]) / max(most[k] - least[k], np.finfo(np.float64).tiny)
+                there = off <= (_DIGITS if cut is None else np.where(cut, _NEARLY, _DIGITS))
                 beyond = sign * (predicted[there, k] - end)
                 if there.sum() >= _FEWEST and np.median(beyond) > _BEYOND * increments[k] > 0.0:
                     ends[k] = end

@@ -60,9 +60,10 @@ def surroundings_of(
     elif not found.noise.negligible:
         clean = smooth(identified, logged, found.theta, found.noise)
     most_models = _FEW_MODELS if slow else _CHOOSING_MODELS if choosing else _MOST_MODELS
-    models = LogModels.of(identified, clean, found, seed=seed).asked(most_models, identified=not choosing)
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
+    models = LogModels.of(identified, clean, found, seed=seed, believed=cost.as_applied)
+    models = models.asked(most_models, identified=not choosing)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
     spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
     rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)

@@ -210,7 +210,7 @@ class Surroundings:
         columns = table.values()
         self.starts = columns.observations[rows]
         self.signals = signals_along(table, rows, n_steps, layout)
-        self.disturbances = models.replayed(table, rows, n_steps)
+        self.disturbances = models.replayed(table, rows, n_steps, cost.as_applied)
         rng = np.random.default_rng([seed, _NOISE])
         self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
         self.returns = returns_along(table, rows, n_steps) + self.before

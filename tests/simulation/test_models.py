@@ -192,3 +192,31 @@ def test_a_model_without_a_vote_is_not_asked_while_controllers_are_chosen() -> N
 class _Three:
     def some(self, kept: NDArray[np.bool_]) -> int:
         return int(kept.sum())
+
+
+def test_what_the_plant_cut_off_is_no_error_of_a_model() -> None:
+    """A store that takes what fits, up to about 10: known from the rows in which costs agree."""
+    rng, n, steps = np.random.default_rng(0), 20, 40
+    x, u = np.empty((n, steps + 1)), rng.uniform(-1.0, 1.0, (n, steps)) + rng.choice([-1.5, 1.5], (n, 1))
+    x[:, 0] = rng.uniform(0.0, 10.0, n)
+    for k in range(steps):
+        x[:, k + 1] = np.clip(x[:, k] + u[:, k], 0.0, 10.0 - 0.02 * x[:, k])  # no two full ones are alike
+    applied = np.abs(x[:, :-1] + u - x[:, 1:]) < 1e-9
+    parts = [v.reshape(-1, 1) for v in (x[:, :-1], u, x[:, 1:])]
+    log = TransitionTable.from_arrays(
+        parts[0], parts[1], applied.ravel().astype(float), parts[2], np.zeros(n * steps), np.repeat(np.arange(n), steps)
+    )  # its "costs" say where the input was applied
+
+    def believed(table: TransitionTable) -> NDArray[np.bool_]:
+        return np.asarray(table.costs) > 0.5
+
+    mpc = walk_mpc(0.0)
+    blind, seeing = (LogModels.of(mpc, log, None, n_residual=2, believed=each) for each in (None, believed))
+    assert seeing.errors[0] < 1e-5  # float32's
+    assert seeing.votes[0]
+    assert "residual 1" not in seeing.names  # nothing is missed
+    states = np.full((len(seeing), 1, 1), 9.0)
+    assert float(seeing.step(states, np.full_like(states, 3.0)).max()) == pytest.approx(9.8, abs=0.05)
+    rows = np.arange(0, n * steps, steps)
+    np.testing.assert_allclose(seeing.replayed(log, rows, steps, believed), 0.0, atol=1e-5)
+    assert np.abs(blind.replayed(log, rows, steps)[0]).max() > 0.3

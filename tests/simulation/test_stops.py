@@ -33,3 +33,17 @@ def test_noise_hides_a_stop_and_units_do_not() -> None:
         assert not np.isfinite(found.low).any()
     assert not np.isfinite(Stops.of(x, reached + 1e-3 * rng.normal(size=x.shape), predicted).high).any()
     assert not np.isfinite(Stops.of(x[:0], reached[:0], predicted[:0]).high).any()
+
+
+def test_a_leaking_tank_is_full_a_little_below_where_it_is_known_to_have_been_cut_off() -> None:
+    rng = np.random.default_rng(2)
+    level = rng.uniform(0.0, 10.0, (2_000, 1))
+    flow = rng.uniform(0.0, 3.0, level.shape)
+    room = 10.0 - level
+    predicted, reached = 0.998 * level + flow, 0.998 * level + np.minimum(flow, room)
+    cut = (flow > room)[:, 0]
+    assert not np.isfinite(Stops.of(level, reached, predicted).high).any()
+    found = Stops.of(level, reached, predicted, cut)
+    np.testing.assert_array_equal(found.high, reached.max(axis=0))
+    assert 9.98 <= found.high[0] <= 10.0
+    assert not np.isfinite(found.low).any()
