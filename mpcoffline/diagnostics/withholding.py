@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from mpcoffline.simulation.trials import Trials
 
 from .differences import Difference, outvoted, starts_of
 from .measures import LagCheck
+
+if TYPE_CHECKING:
+    from .report import Report
 
 _MUCH_NOISE = 0.12  # of the states' spread
 _FEW_ROWS = 500
@@ -42,6 +46,12 @@ class Evidence:
     noise: NoiseEstimate | None = None
     n_rows: int | None = None
     cost_r2: float = 1.0
+
+    @classmethod
+    def of(cls, report: Report) -> Evidence:
+        """What a report rests on."""
+        proposal = report.judgement.proposal
+        return cls(report.trials, proposal, report.lag, report.noise, report.n_rows, report.cost_r2)
 
 
 #: Says why nothing may be recommended and what to do, or None.
