@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
+import torch
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.mpc import MPC
@@ -92,9 +93,12 @@ def are_slow(policies: Iterable[MPCPolicy]) -> bool:
 
 
 def quick_policy(mpc: MPC) -> MPCPolicy:
-    """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem."""
+    """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem.
+
+    It takes as many threads as torch does, which change no digit.
+    """
     if "ddp" in SOLVERS and not SOLVERS["ddp"].refuses(mpc):
-        policy = MPCPolicy(mpc, "ddp")
+        policy = MPCPolicy(mpc, "ddp", n_threads=torch.get_num_threads())
         with contextlib.suppress(CompilerError):
             _ = policy.solver
             return policy
