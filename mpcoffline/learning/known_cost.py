@@ -283,6 +283,8 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int) -> MPC | 
     if coordinates.size == 0:
         return None
     _, logged, inputs, _ = _costs(mpc, few)
+    if not len(logged):  # every row ends an episode
+        return None
     s, a, size = inputs[:, : mpc.nx].T, inputs[:, mpc.nx :].T, float(logged.std())
     if not size > 0.0:
         return None
