@@ -15,7 +15,7 @@ from mpcoffline.estimation import Residual
 from mpcoffline.estimation.identification import OneStepProblem, Rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.integrators import Scheme
-from mpcoffline.mpc.substeps import Flow
+from mpcoffline.mpc.substeps import Flow, choice_on
 from mpcoffline.mpc.torch_twin import TorchTwin
 
 _ROWS = 3_000  # on which the parameters are identified
@@ -24,7 +24,8 @@ _FARTHEST = 0.3  # in scaled coordinates
 _FEW_EPISODES = 5
 _ITERATIONS = 20
 _WEAKEST_PRIOR = 1e-8
-_FINER = 4
+_FARTHER, _FAR_ROWS = 2.0, 500
+_FINEST = 16  # substeps
 
 
 class Members:
@@ -107,17 +108,29 @@ class _Networks:
         return np.asarray(self._limit * z / (1.0 + far**4))
 
 
-def finer(mpc: MPC) -> MPC:
-    """An MPC whose model takes four times the substeps, as far as can be compiled.
+def finer(mpc: MPC, x: Array, u: Array) -> MPC:
+    """An MPC whose model takes as many substeps as states twice as far out as the logged ones ask for.
 
     The model's own are enough where the log was. Simulations go on from there, and what is faster there blows up though
     the plant does not. It stays as it is where the user has said how it is integrated.
+
+    Args:
+        mpc: The MPC.
+        x: Logged states of the plant, ``(N, n)``.
+        u: What acted on them, ``(N, m)``.
     """
     model = mpc.model
     if model.integrator != "auto" or model.ode is None or model.scheme is None or model.scheme.kind == "exact":
         return mpc
-    most = max(model.scheme.substeps, Flow(model.ode, model.dt, model.space.theta).most)
-    return mpc.replace(model=model.with_scheme(Scheme("rk4", min(_FINER * model.scheme.substeps, most))))
+    some = np.linspace(0, len(x) - 1, min(len(x), _FAR_ROWS)).astype(np.intp)
+    far, u = x.mean(axis=0) + _FARTHER * (x[some] - x.mean(axis=0)), u[some]
+    flow, now = Flow(model.ode, model.dt, model.space.theta), model.scheme.substeps
+    reached = flow(far, u, flow.most)
+    known = np.isfinite(reached).all(axis=1)
+    if not known.any():
+        return mpc
+    needed = choice_on(flow, far[known], u[known], reached[known], now).substeps
+    return mpc.replace(model=model.with_scheme(Scheme("rk4", max(now, min(needed, _FINEST)))))
 
 
 def moved_parameters(

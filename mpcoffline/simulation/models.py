@@ -103,9 +103,9 @@ class LogModels:
         Raises:
             InvalidDataError: If the data have other dimensions than the MPC.
         """
-        mpc = finer(mpc)
         states, rng = excerpt(state_rows(mpc, table), _EXCERPT, seed), np.random.default_rng(seed)
         rows, held_out = plant_rows(mpc, states), HeldOut.of(states.episode_ids, seed).rows
+        mpc = finer(mpc, *(np.asarray(each, dtype=np.float64) for each in (rows.observations, rows.actions)))
         free = np.flatnonzero(~held_out)
         problem, unwrapped = _problem(mpc, rows.take(free))
         x, u, reached = problem.rows
