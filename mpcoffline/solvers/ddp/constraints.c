@@ -8,6 +8,8 @@
 #define CLOSER 4.0
 #define STUCK 2.0            /* times in a row: then its square */
 #define LARGEST_WEIGHT 1e7   /* times the first: a hard limit that is not near its solution then, cannot be kept */
+#define UNAFFORDABLE 30.0    /* times all other costs there and what candidates differ by: no more is paid for hard limits */
+#define FEW_INNER 12         /* iterations of a minimisation in which those that are stuck cost more than all else */
 #define RELAXED 10.0         /* what a weight falls by from plan to plan, at least, */
 #define STIFF 100.0          /* to no more than this times the first one: stiffer problems are slow */
 #define FEASIBLE 1e-6        /* scales of an element: it counts as kept */
@@ -130,6 +132,25 @@ static vl is_near(const lanes *w, const vd *off, vd overpaid) {
     return near;
 }
 
+/* What is paid for hard limits: nothing at a solution; for convex problems it is a lower bound of what keeping them costs. */
+static vd paid_for_hard(const mpc_problem *m, const lanes *w) {
+    const limits *c = &w->c;
+    vd paid = V(0.0);
+    double weight = 1.0;
+    for (int64_t k = 0; k <= m->horizon; ++k, weight *= m->discount)
+        for (int j = k < m->horizon ? 0 : END_FIRST; j < (k < m->horizon ? STAGE_LIMITS : LIMITS); ++j)
+            if (is_imposed(c, k, j) && !(limit_l1[j] < INFINITY))
+                paid += weight * psi(c, j, c->multiplier[k * LIMITS + j], c->h[k * LIMITS + j]);
+    return paid;
+}
+
+/* What the costs of candidates differ by, which the first weights were made of. */
+static vd spread_of_costs(const mpc_problem *m, const limits *c) {
+    vd costs = V(0.0);
+    for (int j = 0; j < LIMITS; ++j) costs = vd_max(costs, c->first_rho[j] * c->scale[j] * c->scale[j]);
+    return costs * ((double)m->horizon / FIRST_WEIGHT);
+}
+
 /* Of two plans the one that keeps its limits, or violates them less: 1 the first, -1 the other, 0 either. */
 static int keeps_better(double violation, double other) {
     int kept = violation <= FEASIBLE, other_kept = other <= FEASIBLE;
@@ -155,17 +176,33 @@ static void price_again(const mpc_problem *m, lanes *w, vl changed) {
     w->size = vd_select(changed, size, w->size);
 }
 
+/* Where hard limits cannot be kept, all of them become as dear as the dearest: which of them is violated by how much depends
+ * on their scales alone, not on when each was found to be stuck. */
+static void balance(limits *c, vl lost) {
+    vd dearest = V(0.0);
+    if (!vl_any(lost)) return;
+    for (int j = 0; j < LIMITS; ++j)
+        if (!(limit_l1[j] < INFINITY)) dearest = vd_max(dearest, c->rho[j] / c->first_rho[j]);
+    for (int j = 0; j < LIMITS; ++j)
+        if (!(limit_l1[j] < INFINITY)) c->rho[j] = vd_select(lost, dearest * c->first_rho[j], c->rho[j]);
+}
+
 /* Lanes whose minimisation has ended get new multipliers, and go on; converged and stalled are left to those that are
- * through. Returns those that cannot be solved. */
+ * through. Those that cannot be solved have one more minimisation, with the weights in balance, after which they are
+ * returned. While hard limits that are stuck cost more than all else, minimisations are short and not exact. */
 static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
     limits *c = &w->c;
     vd off[LIMITS];
     c->inner += 1.0;
-    vl capped = vd_le(V(MOST_INNER), c->inner) & ~(*converged | *stalled);
+    vd most = vd_select(vd_lt(V(0.0), c->dominated), V(FEW_INNER), V(MOST_INNER));
+    vl capped = vd_le(most, c->inner) & ~(*converged | *stalled);
     vl ended = (*converged | *stalled | capped) & vd_lt(vd_abs(w->J), V(INFINITY));
     if (!vl_any(ended)) return no_lanes();
     vd overpaid = distances(m, w, off);
-    vl near = is_near(w, off, overpaid), lost = no_lanes();
+    vl near = is_near(w, off, overpaid), lost = no_lanes(), held = no_lanes();
+    vl told = ended & ~near & vd_lt(V(1.0), c->dominated);
+    vd paid = paid_for_hard(m, w), others = w->size - vd_abs(paid);
+    vl dear = vd_lt(UNAFFORDABLE * (others + spread_of_costs(m, c)), paid);
     vl through = ended & near & vd_le(c->tolerance, V(m->tolerance)) & ~capped;
     vl go_on = ended & ~through;
     for (int64_t k = 0; k <= m->horizon; ++k)
@@ -177,13 +214,20 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
         vl slow = go_on & vd_lt(V(FEASIBLE), off[j]) & vd_lt(c->before[j] / CLOSER, off[j]);
         c->stuck[j] = vd_select(go_on, vd_select(slow, c->stuck[j] + 1.0, V(0.0)), c->stuck[j]);
         vl often = vd_le(V(STUCK), c->stuck[j]);
-        if (!(limit_l1[j] < INFINITY)) lost |= slow & vd_lt(LARGEST_WEIGHT * c->first_rho[j], c->rho[j]);
-        c->rho[j] = vd_select(slow & (often | ~capped), vd_select(often, V(GROWTH * GROWTH), V(GROWTH)) * c->rho[j], c->rho[j]);
+        if (!(limit_l1[j] < INFINITY)) {
+            held |= often;
+            lost |= slow & ((often & dear) | vd_lt(LARGEST_WEIGHT * c->first_rho[j], c->rho[j]));
+        }
+        vd more = vd_select(often, V(GROWTH * GROWTH), V(GROWTH)) * c->rho[j];
+        c->rho[j] = vd_select(slow & ~told & (often | ~capped), more, c->rho[j]);
         c->before[j] = vd_select(go_on, off[j], c->before[j]);
     }
-    weigh(c);
     vd next = vd_select(near, V(m->tolerance), vd_max(0.1 * c->tolerance, V(m->tolerance)));
-    c->tolerance = vd_select(go_on & ~capped, next, c->tolerance);
+    held &= vd_lt(others, paid);
+    balance(c, lost & ~told);
+    weigh(c);
+    c->dominated = vd_select(go_on, vd_select(lost, V(2.0), vd_select(held, V(1.0), V(0.0))), c->dominated);
+    c->tolerance = vd_select(go_on & ~(capped | held), next, c->tolerance);
     c->looser = vd_sqrt(c->tolerance / m->tolerance);
     c->inner = vd_select(go_on, V(0.0), c->inner);
     w->mu = vd_select(go_on, V(0.0), w->mu);
@@ -191,7 +235,7 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
     price_again(m, w, go_on);
     *converged &= through;
     *stalled &= ~go_on;
-    return lost;
+    return told;
 }
 
 /* What the candidates of a problem say of the sizes of its costs and limits: n of them so far. */

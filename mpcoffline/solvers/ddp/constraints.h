@@ -38,6 +38,7 @@ typedef struct {
     vd base, base_new, base_size, base_size_new;      /* costs without psi */
     vd tolerance, looser;                             /* of this minimisation, and times what of the first input */
     vd inner;                                         /* its iterations */
+    vd dominated;                                     /* 1: by hard limits that are stuck; 2: which cannot be kept */
     struct survey *asked;                             /* what rollouts of candidates are noted in, or NULL */
     vd violation;                                     /* of the hard limit that is violated most, in scales */
     int given;                                        /* whether the first input is imposed */

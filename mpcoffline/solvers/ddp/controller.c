@@ -59,7 +59,7 @@ static void load_limits(const mpc_problem *m, mpc_state *state, lanes *w, double
     }
     w->c.tolerance = tolerance > m->tolerance ? tolerance : m->tolerance;
     w->c.looser = sqrt(w->c.tolerance / m->tolerance);
-    w->c.inner = 0.0;
+    w->c.inner = w->c.dominated = 0.0;
     weigh(&w->c);
 }
 

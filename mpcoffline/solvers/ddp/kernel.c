@@ -81,7 +81,7 @@ static void load_limits(const mpc_problem *m, const mpc_batch *b, lanes *w, int 
     double tolerance = b->guess == PLAN ? WARM_TOLERANCE : FIRST_TOLERANCE;
     c->tolerance[lane] = tolerance > m->tolerance ? tolerance : m->tolerance;
     c->looser[lane] = sqrt(c->tolerance[lane] / m->tolerance);
-    c->inner[lane] = 0.0;
+    c->inner[lane] = c->dominated[lane] = 0.0;
     c->given = b->u0 != NULL;
     weigh(c);
 }
@@ -156,12 +156,12 @@ static void store_lane(const mpc_problem *m, const mpc_batch *b, const lanes *w,
 #if LIMITS
 #define HOPELESS 3.0         /* times in a row, when the iterations are used up: then it cannot be kept */
 
-/* Lanes with a hard limit that comes no closer to being kept. */
+/* Lanes with a hard limit that comes no closer to being kept, however much is paid. */
 static vl is_hopeless(const lanes *w) {
     vl lost = no_lanes();
     for (int j = 0; j < LIMITS; ++j)
         if (!(limit_l1[j] < INFINITY)) lost |= vd_le(V(HOPELESS), w->c.stuck[j]);
-    return lost;
+    return lost & vd_lt(V(0.0), w->c.dominated);
 }
 
 /* The same, with the true cost and the worst violation, and multipliers for the next plan; a solution that is only one of a

@@ -262,3 +262,17 @@ def test_auto_takes_it() -> None:
     solver = make_solver(double_integrator(slow()), "auto")
     assert solver.name == "ddp"
     assert solver.n_starts == 1  # affine model and limits, convex costs: one minimum
+
+
+def test_what_cannot_be_kept_is_told_soon() -> None:
+    """In no more than 10 times the iterations of the others."""
+    problem = PROBLEMS["cart-pole"]
+    x = problem.draw(24, np.random.default_rng(4))
+    x[12:, 1] = np.where(x[12:, 0] > 0.0, 2.0, -2.0)  # too fast for what is left of the track
+    solution = DDPSolver(problem.make()).solve(x)
+    kept, lost = solution.success, np.array(solution.status) == "infeasible"
+    assert kept.sum() >= 8
+    assert lost.sum() >= 8
+    iterations = solution.stats["iterations"]
+    assert np.median(iterations[lost]) <= 10.0 * np.median(iterations[kept])
+    assert iterations[lost].max() < 848  # all starts to their last iteration
