@@ -15,6 +15,7 @@
 #define FEASIBLE 1e-6        /* scales of an element: it counts as kept */
 #define PAID 1e-7            /* of the costs' size: what is paid too much for soft ones */
 #define LEAST_SCALE 1e-2     /* of what the candidates say of an element: it is measured by no less */
+#define MOST_WEIGHT 1e250    /* so that units of 1e-200 do not lead to infinities */
 #define SURVEYED 4           /* stages of each candidate whose h say how large it is */
 #define MOST_CANDIDATES 64
 
@@ -295,12 +296,13 @@ static void conclude(const mpc_problem *m, survey *s, double *first_rho, double 
     double costs = spread(s->chosen, n, 0.0, 0.5), dearest = n ? s->chosen[(n - 1) / 2] : 0.0;
     for (int j = 0; j < LIMITS; ++j) {
         n = 0;
-        for (int64_t i = 0; i < s->n * SURVEYED; ++i)
-            {
+        for (int64_t i = 0; i < s->n * SURVEYED; ++i) {
             double h = s->h[j * OF_EACH + i];
             if (s->J[i / SURVEYED] <= dearest && h - h == 0.0) s->chosen[n++] = h;
         }
         scale[j] = spread(s->chosen, n, 0.25, 0.75);
         first_rho[j] = FIRST_WEIGHT * costs / (double)m->horizon / (scale[j] * scale[j]);
+        if (!(first_rho[j] < MOST_WEIGHT)) first_rho[j] = MOST_WEIGHT;
+        if (!(first_rho[j] > 1.0 / MOST_WEIGHT)) first_rho[j] = 1.0 / MOST_WEIGHT;
     }
 }
