@@ -28,6 +28,7 @@ from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Tri
 
 from .differences import TODAY, Difference
 from .figure import Traces
+from .limits import limit_checks, with_limits
 from .measures import (
     bound_names,
     fit_errors,
@@ -134,6 +135,9 @@ def diagnose(
         choice=choice,
         rules=tuple(rules),
     )
+    limits = limit_checks(nominal, table, first, second) if nominal.constraints is not None else ()
+    if chosen != FIRST:
+        judgement = with_limits(judgement, limits)
     reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
     report = Report(
         judgement=judgement,
@@ -162,6 +166,7 @@ def diagnose(
             reference,
         ),
         trust=trust,
+        limits=limits,
     )
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
     fit = Fit(

@@ -19,6 +19,7 @@ from mpcoffline.simulation.trials import Trials
 
 from .differences import TODAY, candidates
 from .figure import Traces, draw
+from .limits import LimitCheck
 from .measures import GoalCheck, LagCheck, RegionError, ValueCheck
 from .stability import TheoremCheck, WeightCheck
 from .verdict import Judgement, Verdict, costs_of
@@ -94,6 +95,7 @@ class Report:
         n_episodes: Episodes.
         traces: What the figure shows besides; not in the JSON form.
         trust: How well the models reproduce what the log itself cost; None where none has a vote.
+        limits: How often each limit of the MPC that was given is violated.
     """
 
     judgement: Judgement
@@ -117,6 +119,7 @@ class Report:
     n_episodes: int
     traces: Traces = field(repr=False, compare=False)
     trust: Trust | None = None
+    limits: tuple[LimitCheck, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -131,7 +134,8 @@ class Report:
     def __str__(self) -> str:
         """The report as plain text."""
         p = self.prediction
-        lines = [f"Verdict: {self.verdict}", *map(_item, self.reasons), *self._costs(), *self._candidates()]
+        lines = [f"Verdict: {self.verdict}", *map(_item, self.reasons), *self._costs(), *self._limits()]
+        lines += self._candidates()
         for title, items in (("Notes", self.notes), ("What the fit found", self.findings)):
             lines += [title, *map(_item, items)] if items else []
         rows = [
@@ -175,6 +179,18 @@ class Report:
         if self.trust is not None:
             voting += f"; left to themselves under the log's own controller, their costs are {self.trust}"
         return [title, *_columns(rows), _item(f"{voting}.")]
+
+    def _limits(self) -> list[str]:
+        """How often, and by how much at most, limits are violated."""
+        rows: list[tuple[str, ...]] = [("", "the log", self.trials.names[0], self.judgement.proposal)]
+        for check in self.limits:
+            told = [
+                f"{share:.1%}" + (f" ({most:.2g})" if most > 0.0 else "")
+                for share, most in zip(check.shares, check.largest, strict=True)
+            ]
+            rows.append((f"{check.name} ({check.kind})", *told))
+        title = "Limits: share of the steps that violate them (by how much at most), on the identified model"
+        return [title, *_columns(rows)] if self.limits else []
 
     def _candidates(self) -> list[str]:
         """What was tried, the cheapest first: in the choice, where there was one."""

@@ -17,6 +17,7 @@ from .interface import SOLVERS, Plan, Solution, Solver
 from .ipopt.solver import IpoptSolver
 from .lqr import LQRSolver
 from .options import check_options
+from .softening import softened
 from .status import Stats, Status
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "Stats",
     "Status",
     "make_solver",
+    "softened",
 ]
 
 logger = logging.getLogger(__name__)

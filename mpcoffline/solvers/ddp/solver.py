@@ -217,6 +217,17 @@ class DDPSolver(Solver):
             return np.zeros(len(x))
         return self._survey(x, self._theta, None, u)["violation"]
 
+    def limit_prices(self, x: Array) -> Array:
+        """A price of each element of limits that is dear, by the sizes of costs and limits, ``(B, n)``.
+
+        A hundred spreads of the stage cost over that of the element, along random input sequences from states ``(B,
+        nx)``.
+        """
+        if self._limited is None:
+            return np.zeros((len(x), 0))
+        found = self._survey(x, self._theta, None, None)["multipliers"]
+        return np.asarray(found[:, -2] * found[:, -1])  # first weights and scales
+
     def _rounded(self) -> Rounding:
         """What solves the problem where its corners stand in the way; made when it is first needed."""
         if self._rounding is None:

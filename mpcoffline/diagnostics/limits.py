@@ -1,0 +1,121 @@
+"""How often limits are violated: in the log, and by MPC_1 and the proposal on the identified model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC, Penalty
+from mpcoffline.simulation.trials import Episodes
+
+from .verdict import Judgement
+
+_TRIFLE = 1e-3  # of how far h moves: a violation by less is rounding and noise
+_SURE = 2.0  # standard errors
+_LEAST = 0.005  # of the steps: a smaller difference is none
+
+
+@dataclass(frozen=True)
+class LimitCheck:
+    """Violations of a limit along the horizon, by more than a thousandth of how far it moves.
+
+    Limits are those of the MPC that was given, with its parameters; those at the end of the horizon are left out, as no
+    episode ends there.
+
+    Attributes:
+        name: Of the constraint.
+        kind: ``"hard"``, or its prices.
+        shares: Of the steps of the log, of MPC_1's and of the proposal's that violate it.
+        largest: The largest violation of each, 0 for none, in the unit of the element of h that has it.
+        worse: Whether the proposal violates it in more steps than MPC_1, beyond two standard errors.
+    """
+
+    name: str
+    kind: str
+    shares: tuple[float, float, float]
+    largest: tuple[float, float, float]
+    worse: bool
+
+
+def limit_checks(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Episodes) -> tuple[LimitCheck, ...]:
+    """Counts violations.
+
+    Args:
+        mpc: The MPC that was given, of whose limits they are.
+        table: The log, in the MPC's states.
+        first: What MPC_1 does.
+        proposal: What the controller does that is judged.
+    """
+    columns = table.values()
+    log = columns.observations[None], np.asarray(columns.actions, dtype=np.float64)[None]
+    runs = [log, *((each.states[:, :-1], each.actions) for each in (first, proposal))]
+    found = []
+    for name, soft, function in _limits(mpc):
+        elements = [_along(function, *run, mpc.theta) for run in runs]
+        together = np.concatenate([h.reshape(-1, h.shape[-1]) for h in elements])
+        moved = np.ptp(np.where(np.isfinite(together), together, 0.0), axis=0)
+        violated = [(h > _TRIFLE * moved).any(axis=-1) for h in elements]
+        shares = tuple(float(each.mean()) for each in violated)
+        more = violated[2].mean(axis=1) - violated[1].mean(axis=1)
+        error = more.std() / np.sqrt(len(more))
+        largest = tuple(_largest(h, moved) for h in elements)
+        worse = bool(more.mean() > max(_SURE * error, _LEAST))
+        found.append(LimitCheck(name, _kind(soft), _three(shares), _three(largest), worse))
+    return tuple(found)
+
+
+def with_limits(judgement: Judgement, checks: tuple[LimitCheck, ...]) -> Judgement:
+    """The judgement, with a recommendation withheld where the proposal violates limits more often than MPC_1."""
+    worse = [check for check in checks if check.worse]
+    if not worse:
+        return judgement
+    told = tuple(
+        f"{judgement.proposal} violates the limit {check.name!r} ({check.kind}) in {check.shares[2]:.1%} of the steps,"
+        f" MPC_1 in {check.shares[1]:.1%}: make it tighter than it is by what the models miss, or price it higher."
+        for check in worse
+    )
+    kept = "try with care" if judgement.verdict == "recommend" else judgement.verdict
+    return replace(judgement, verdict=kept, reasons=(*judgement.reasons[:1], *told, *judgement.reasons[1:]))
+
+
+def _limits(mpc: MPC) -> Iterator[tuple[str, Penalty | None, ca.Function]]:
+    """Names, prices and ``(x, u, theta) -> h`` of all limits along the horizon."""
+    x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
+    for constraint in mpc.constraints_at("stages"):
+        h = ca.densify(mpc.constraint_expression(constraint)(x, u, theta))
+        yield constraint.name, constraint.soft, ca.Function("h", [x, u, theta], [h])
+    for bounds in mpc.state_bounds:
+        h = ca.densify(bounds.expression(x))
+        if h.numel():
+            yield bounds.name, bounds.soft, ca.Function("h", [x, u, theta], [h])
+
+
+def _along(function: ca.Function, x: Array, u: Array, theta: Array) -> Array:
+    """H along trajectories ``(B, T, nx)``, ``(B, T, nu)``: ``(B, T, n)``."""
+    flat = [part.reshape(-1, part.shape[-1]).T for part in (x, u)]
+    h: Array = function(*flat, theta).full().T
+    return h.reshape(*x.shape[:2], -1)
+
+
+def _largest(h: Array, moved: Array) -> float:
+    """The largest of the violations, each compared with others by how far its element moves."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative: NDArray[np.float64] = np.nan_to_num(np.maximum(h, 0.0) / moved, nan=0.0, posinf=0.0)
+    return float(max(h.reshape(-1)[relative.argmax()], 0.0))
+
+
+def _kind(soft: Penalty | None) -> str:
+    if soft is None:
+        return "hard"
+    return ", ".join(f"{name} = {weight:.3g}" for name, weight in zip(soft._fields, soft, strict=True) if weight)
+
+
+def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
+    first, second, third = values
+    return first, second, third
