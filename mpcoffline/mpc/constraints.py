@@ -109,7 +109,8 @@ class Constraint(AnyConstraint):
         """The constraint with its function traced by CasADi.
 
         Raises:
-            InvalidArgumentError: For a function that is not one of CasADi SX expressions, or is not a column.
+            InvalidArgumentError: For a function that is not one of CasADi SX expressions, is not a column, or does not
+                depend on the plant's states or inputs.
         """
         symbols = [ca.SX.sym("x", sizes.nx), ca.SX.sym("u", sizes.nu), ca.SX.sym("p", sizes.parameters.size)]
         arguments = symbols[::2] if self.terminal else symbols
@@ -132,6 +133,12 @@ class Constraint(AnyConstraint):
             ) from error
         if h.shape[1] != 1 or h.shape[0] == 0:
             raise InvalidArgumentError(self.name, expected="a column", actual=f"shape {h.shape}")
+        if not ca.depends_on(h, ca.vertcat(symbols[0][: sizes.n_states], *arguments[1:-1])):
+            raise InvalidArgumentError(
+                self.name,
+                expected="a limit of the plant's states or inputs, which a plan can change",
+                actual="one of signals, parameters or numbers alone",
+            )
         return replace(self, function=traced(self.name, ca.Function("h", arguments, [h])))
 
     def to_json(self) -> dict[str, Any]:
@@ -172,7 +179,7 @@ class StateBounds(AnyConstraint):
         soft: None for hard bounds, else the price of violating them.
 
     Raises:
-        InvalidArgumentError: For bounds that cross or are of different shapes.
+        InvalidArgumentError: For bounds that cross, are NaN or of different shapes, or that no number can keep.
     """
 
     low: ArrayLike
@@ -186,6 +193,8 @@ class StateBounds(AnyConstraint):
         low, high = (np.atleast_1d(np.array(bound, dtype=np.float64)) for bound in (self.low, self.high))
         if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
             raise InvalidArgumentError(self.name, expected="low <= high of one shape", actual=f"{low} and {high}")
+        if (low == np.inf).any() or (high == -np.inf).any():
+            raise InvalidArgumentError(self.name, expected="low < inf and high > -inf", actual=f"{low} and {high}")
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
 
@@ -235,10 +244,11 @@ Constraints = ConstraintFunction | AnyConstraint | Sequence[AnyConstraint]
 
 
 def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[Constraint | StateBounds, ...] | None:
-    """The constraints of an MPC as a tuple, checked against its sizes; None where there are none.
+    """The constraints of an MPC as a tuple, checked against its sizes; None where there are none that bound anything.
 
     Raises:
-        InvalidArgumentError: For something else than constraints, names that occur twice, or sizes that do not fit.
+        InvalidArgumentError: For something else than constraints, names that occur twice, sizes that do not fit, or
+            hard state bounds that contradict each other.
     """
     if given is None:
         return None
@@ -261,7 +271,29 @@ def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[Constra
     names = [constraint.name for constraint in fitted]
     if len(set(names)) < len(names):
         raise InvalidArgumentError("names of constraints", expected="unique names", actual=str(names))
-    return fitted or None
+    _refuse_contradicting([form for form in fitted if isinstance(form, StateBounds) and form.soft is None], sizes)
+    return tuple(form for form in fitted if not _is_empty(form)) or None
+
+
+def _is_empty(form: Constraint | StateBounds) -> bool:
+    """Whether it bounds nothing."""
+    return isinstance(form, StateBounds) and not np.isfinite([form.low, form.high]).any()
+
+
+def _refuse_contradicting(bounds: Sequence[StateBounds], sizes: Sizes) -> None:
+    """Refuses hard bounds of which no state can keep all."""
+    full = [form.padded(sizes.nx - np.size(form.low)) for form in bounds]
+    for first in full:
+        for second in full:
+            crossed = np.flatnonzero(np.asarray(first.low) > np.asarray(second.high))
+            if len(crossed):
+                i = int(crossed[0])
+                low, high = np.asarray(first.low)[i], np.asarray(second.high)[i]
+                raise InvalidArgumentError(
+                    f"state bounds {first.name!r} and {second.name!r}",
+                    expected="some value of each state that both allow",
+                    actual=f"at least {low:g} and at most {high:g} of state {i}",
+                )
 
 
 def constraints_to_json(
@@ -304,10 +336,13 @@ def _penalty_from_json(data: Sequence[float] | None) -> Penalty | None:
 def _checked_penalty(name: str, penalty: Penalty | None) -> Penalty | None:
     if penalty is None:
         return None
-    weights = Penalty(*penalty)
+    try:
+        weights = Penalty(*map(float, penalty))
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(f"{name}.soft", expected="Penalty(l1, l2), or None", actual=repr(penalty)) from error
     if not all(np.isfinite(w) and w >= 0.0 for w in weights) or sum(weights) == 0.0:
         raise InvalidArgumentError(f"{name}.soft", expected="weights >= 0, one of them positive", actual=str(penalty))
-    return Penalty(float(weights.l1), float(weights.l2))
+    return weights
 
 
 def _finite_or_none(values: Array) -> list[float | None]:

@@ -28,7 +28,7 @@ ADDED: dict[str, Any] = {
     "none": lambda nx: [],
     "contradicting": lambda nx: [Constraint(lambda x, u, p: ca.vertcat(x[0] - 1.0, 1.001 - x[0]), "both")],
     "a single point": lambda nx: [StateBounds(_everywhere(nx, 0.1), _everywhere(nx, 0.1), "point")],
-    "a constant": lambda nx: [Constraint(lambda x, u, p: 1.0 + 0.0 * x[0], "never")],
+    "a constant": lambda nx: [Constraint(lambda x, u, p: ca.vertcat(1.0, x[0] - 1e3), "never")],
     "a root": lambda nx: [Constraint(lambda x, u, p: ca.sqrt(x[0]) - 1.0, "root")],
     "huge": lambda nx: [Constraint(lambda x, u, p: 1e200 * (x[0] - 0.5), "huge")],
     "tiny": lambda nx: [Constraint(lambda x, u, p: 1e-200 * (x[0] - 0.5), "tiny")],
