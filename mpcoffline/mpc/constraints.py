@@ -277,7 +277,7 @@ def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[Constra
 
 def _is_empty(form: Constraint | StateBounds) -> bool:
     """Whether it bounds nothing."""
-    return isinstance(form, StateBounds) and not np.isfinite([form.low, form.high]).any()
+    return isinstance(form, StateBounds) and not np.isfinite(np.array([form.low, form.high])).any()
 
 
 def _refuse_contradicting(bounds: Sequence[StateBounds], sizes: Sizes) -> None:

@@ -71,7 +71,8 @@ def _elements(mpc: MPC) -> Iterator[tuple[Constraint | StateBounds, slice, bool]
     end = [c for c in given if isinstance(c, Constraint) and c.terminal]
     x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
     first = 0
-    for constraint in [*along, *(c for c in given if isinstance(c, StateBounds)), *end]:
+    ordered: list[Constraint | StateBounds] = [*along, *(c for c in given if isinstance(c, StateBounds)), *end]
+    for constraint in ordered:
         if isinstance(constraint, StateBounds):
             h = constraint.padded(mpc.nx - np.size(constraint.low)).expression(x)
         else:
@@ -82,4 +83,5 @@ def _elements(mpc: MPC) -> Iterator[tuple[Constraint | StateBounds, slice, bool]
 
 
 def _given(mpc: MPC) -> tuple[Constraint | StateBounds, ...]:
-    return mpc.constraints if isinstance(mpc.constraints, tuple) else ()
+    given = mpc.constraints if isinstance(mpc.constraints, tuple) else ()
+    return tuple(each for each in given if isinstance(each, Constraint | StateBounds))
