@@ -25,6 +25,8 @@ from .quantities import Input, Limit, State, Values, check_identifier
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from mpcoffline.datasets.logs.reading import LoggedTable
+
 _WIDE = 100.0  # times and parts of its value that a parameter may become where nothing is said
 
 Function = Callable[..., Any]
@@ -248,6 +250,56 @@ class Plant:
         return control_problem(
             self, self.horizon if horizon is None else horizon, self.discount if discount is None else discount
         )
+
+    def read(
+        self,
+        log: Any,
+        *,
+        columns: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        time: str | Sequence[str] | None = None,
+        time_format: str | None = None,
+        timezone: str | None = None,
+        episode: str | None = None,
+        where: Mapping[str, Any] | None = None,
+        max_gap: float | None = None,
+    ) -> LoggedTable:
+        """Reads a log of this plant; needs ``pip install "mpcoffline[logs]"``.
+
+        Columns are found by name, whatever the case and signs between letters, with the unit in the header, as
+        ``h1 [mm]``, ``h1 (mm)`` or ``h1_mm``, and converted to the plant's. Rows may be at any times: states are taken
+        linearly between them, signals as last known, inputs by their mean over the control interval. What cannot be
+        is left out, and gaps begin new episodes; ``table.report`` says what and why. Costs are the plant's own.
+
+        Args:
+            log: A file (CSV and other text, Parquet, Arrow), a frame (polars, pandas, pyarrow), or a list of them.
+            columns: Headers by the plant's names, where they are others.
+            units: Units of the log by the plant's names, where headers do not say them.
+            time: Header of the time, or of date and time; looked for by default, and without one rows are taken to be
+                ``dt`` apart.
+            time_format: How stamps are written, as ``"%d.%m.%Y %H:%M"``; found out by default.
+            timezone: Of stamps without offset, as ``"Europe/Berlin"``, for its daylight saving.
+            episode: Header of a column that tells episodes apart.
+            where: Values of further columns that rows must have, as ``{"mode": ["AUTO", "CASCADE"]}``.
+            max_gap: Seconds between rows beyond which a new episode begins; by default one and a half
+                control intervals. Logs that hold changes only need more.
+
+        Raises:
+            InvalidDataError: For a log that cannot be understood; names row and column.
+            InvalidArgumentError: For options that do not fit.
+            StorageError: For a file that cannot be read.
+        """
+        from mpcoffline.datasets.logs.collecting import Options
+        from mpcoffline.datasets.logs.columns import Quantity
+        from mpcoffline.datasets.logs.reading import Wanted, read_log
+
+        states, inputs, signals = (
+            [Quantity(q.name, q.unit, q.low, q.high) for q in each] for each in (self.states, self.inputs, self.signals)
+        )
+        previews, periods = [s.preview for s in self.signals], [s.period for s in self.signals]
+        wanted = Wanted(self.dt, states, inputs, signals, previews, periods, self.costs)
+        options = Options(columns or {}, units or {}, time, time_format, timezone, episode, where or {}, max_gap)
+        return read_log(log, wanted, options)
 
     def env(self, **options: Any) -> gym.Env[Any, Any]:
         """A Gymnasium environment that simulates this plant.
