@@ -11,6 +11,7 @@ import pytest
 from two_tanks import dynamics, root, two_tanks
 
 from mpcoffline import MPC, Input, InvalidArgumentError, Limit, Parameter, QuadraticCost, Signal, State, make_solver
+from mpcoffline.estimation.findings import Finding, named
 from mpcoffline.mpc import Constraint, ExpressionCost, StateBounds
 
 rng = np.random.default_rng(0)
@@ -204,3 +205,13 @@ def test_the_errors_place_is_that_of_the_line() -> None:
     line = wrong.__code__.co_firstlineno + 2
     with pytest.raises(InvalidArgumentError, match=f"{Path(__file__).name}, line {line}\\)"):
         two_tanks(dynamics=wrong)
+
+
+def test_findings_call_columns_by_their_names() -> None:
+    mpc = two_tanks().mpc()
+    finding = Finding(
+        "observations 0 and 1", "a sign", "that of action 0, observation 2 and observation 7", "", "error"
+    )
+    found = named(finding, mpc)
+    assert (found.name, found.actual) == ("h1 and h2", "that of pump, set_point and observation 7")
+    assert found.kind == "error"

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_logs import Case, changed, found_in, heater, is_named, logged, tanks
+from planted_logs import Case, changed, found_in, heater, is_named, logged
 from typer.testing import CliRunner
 
 from mpcoffline import Input, Plant, State
 from mpcoffline.cli import app
-from mpcoffline.tune import check_log
+from mpcoffline.cli.own_plants import _show
+from mpcoffline.core.tables import Table
+from mpcoffline.tune import LogCheck, check_log
 from mpcoffline.tune.experiment import experiments
 
 pytest.importorskip("polars")
@@ -73,31 +75,35 @@ def test_the_experiment_is_as_long_as_its_noise_asks_for() -> None:
     assert found["b"].steps == pytest.approx(100 / 0.8**2, abs=1)
 
 
-def test_the_command_prints_one_page_or_json(tmp_path: Path) -> None:
+def test_the_command_gives_json_and_refuses_in_a_line(tmp_path: Path) -> None:
     runner, file, log = CliRunner(), tmp_path / "heater.py", tmp_path / "log.csv"
     folder = Path(__file__).parents[1] / "helpers"
     file.write_text(
         f"import sys\nsys.path.append({str(folder)!r})\nfrom planted_logs import heater\nplant = heater()\n"
     )
-    rows = np.column_stack([LOG[name] for name in ("time", "T", "ambient", "power")])
-    log.write_text("s,TI-1,ambient,power\n" + "\n".join(",".join(f"{v:.6g}" for v in row) for row in rows))
-    command = ["check", str(file), str(log), "--column", "T=TI-1", "--time", "s"]
-    page = runner.invoke(app, command)
-    assert page.exit_code == 0, page.output
-    assert page.stdout.startswith("Worth tuning.")
-    document = json.loads(runner.invoke(app, [*command, "--unit", "T=K", "--json"]).stdout)
-    assert document["log"]["notes"][0] == "T: K to °C"
+    columns = (LOG["time"], LOG["T"] + 273.15, LOG["ambient"], LOG["power"])
+    rows = (",".join(f"{v:.7g}" for v in row) for row in zip(*columns, strict=True))
+    log.write_text("\n".join(["s,TI-1,ambient,power", *rows]))
     missing = runner.invoke(app, ["check", str(file), str(log)])
     assert missing.exit_code == 1
     assert "log.csv: column of 'T': expected one among" in " ".join(missing.stderr.split())
+    command = ["check", str(file), str(log), "--column", "T=TI-1", "--time", "s", "--unit", "T=K"]
     assert runner.invoke(app, [*command, "--where", "mode"]).exit_code == 2
+    done = runner.invoke(app, [*command, "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["worth_tuning"]
+    assert document["log"]["notes"][0] == "T: K to °C"
+    assert [row["determined"] for row in document["tables"]["Parameters"]] == ["yes", "yes"]
 
 
-def test_exchanged_columns_are_told_by_their_names() -> None:
-    c = logged("tanks", 1, 600)
-    plant = tanks()
-    from mpcoffline import check
-
-    findings = check(plant.mpc(), plant.read(changed(c, h1=c["h2"], h2=c["h1"]))).findings
-    assert [finding.name for finding in findings] == ["h1 and h2"]
-    assert "if h1 and h2 are exchanged" in str(findings[0])
+def test_the_page_is_shown_problems_first(capsys: pytest.CaptureFixture[str]) -> None:
+    page = LogCheck("10 rows", tables=[Table(("parameter", "in the log"), [("k", "1")], title="Parameters")])
+    page.add("problem", "h1", "stuck at 3")
+    page.add("good", "noise", "little")
+    _show(page)
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines == [
+        "Not yet worth tuning: 1 thing is to be looked at first.", "10 rows", "To be mended first", "* h1: stuck at 3",
+        "Good", "* noise: little", "Parameters", "parameter  in the log", "k          1",
+    ]  # fmt: skip
