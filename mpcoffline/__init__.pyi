@@ -34,7 +34,14 @@ from .mpc import (
     Signal as Signal,
     StateBounds as StateBounds,
 )
-from .plants import nominal_mpc as nominal_mpc
+from .plants import (
+    Input as Input,
+    Limit as Limit,
+    Plant as Plant,
+    State as State,
+    load_plant as load_plant,
+    nominal_mpc as nominal_mpc,
+)
 from .sb3 import MPCModel as MPCModel
 from .solvers import make_solver as make_solver
 

@@ -175,6 +175,7 @@ def data_flow(theme: Theme) -> str:
 ROOMS = {
     "cli": ("the program mpcoffline", "use"),
     "studies": ("the paper's experiments", "use"),
+    "tune": ("own plants: log, check", "use"),
     "gallery": ("recipes, agents, data cards", "data"),
     "diagnostics": ("may I trust it?", "learn"),
     "simulation": ("models of the log, closed loops on them", "learn"),

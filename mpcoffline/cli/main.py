@@ -6,7 +6,14 @@ from typing import Annotated
 
 import typer
 
-from . import datasets as cli_datasets, figures as cli_figures, learn as cli_learn, run as cli_run, tools as cli_tools
+from . import (
+    datasets as cli_datasets,
+    figures as cli_figures,
+    learn as cli_learn,
+    own_plants as cli_own_plants,
+    run as cli_run,
+    tools as cli_tools,
+)
 from .common import ErrorGroup, console, progress_to_stderr
 
 app = typer.Typer(
@@ -40,6 +47,6 @@ def main(
     progress_to_stderr()
 
 
-for commands in (cli_run, cli_learn, cli_figures, cli_tools):
+for commands in (cli_run, cli_own_plants, cli_learn, cli_figures, cli_tools):
     app.add_typer(commands.app)
 app.add_typer(cli_datasets.app, name="datasets")

@@ -84,7 +84,10 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
         comment = c_comment(f"{block.name}: {meaning}{unit}")
         fields.append(f"    double {identifiers[block.name]}{size}; /* {comment} */")
     low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
-    bounds = [f" *   u[{a}]: from {low[a]:g} to {high[a]:g}" for a in range(mpc.nu)]
+    labels = mpc.layout.labels
+    names = [f", {c_comment(str(label))}" if labels.inputs else "" for label in mpc.layout.u_labels]
+    columns = [f" *   y[{i}]: {c_comment(str(label))}" for i, label in enumerate(mpc.layout.y_labels) if labels.states]
+    bounds = [f" *   u[{a}]{names[a]}: from {low[a]:g} to {high[a]:g}" for a in range(mpc.nu)]
     replaced = {
         "NX": str(mpc.nx),
         "NY": str(mpc.ny),
@@ -94,7 +97,7 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
         "STARTS": str(solver.n_starts),
         "ITERATIONS": str(solver.max_iterations),
         "DT": f"{mpc.model.dt:g}",
-        "BOUNDS": "\n".join(bounds),
+        "BOUNDS": "\n".join(columns + bounds),
         "FIELDS": "\n".join(fields),
         "LIMITS": _limit_fields(solver.limit_names),
     }

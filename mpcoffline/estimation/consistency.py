@@ -9,7 +9,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
 from . import contradictions, hypotheses
-from .findings import CHECKS, CheckReport, Excerpt, Finding
+from .findings import CHECKS, CheckReport, Excerpt, Finding, named
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -65,9 +65,10 @@ def check(mpc: MPC, data: TransitionTable | MinariDataset | str) -> CheckReport:
         excerpt = Excerpt.of(mpc, table)  # refuses other sizes, and episodes shorter than the dead time
         table.check_fits(mpc.ny, mpc.nu, mpc.action_low, mpc.action_high)
     except InvalidDataError as error:
-        return CheckReport((Finding(error.name, error.expected, error.actual, error.hint, "error"),))
+        finding = Finding(error.name, error.expected, error.actual, error.hint, "error")
+        return CheckReport((named(finding, mpc),))
     for name, look in CHECKS.items():
         if not any(found.get(cause) for cause in _EXPLAINED_BY.get(name, ())):
             found[name] = list(look(mpc, excerpt))
-    every = [each for name in found for each in found[name]]
+    every = [named(each, mpc) for name in found for each in found[name]]
     return CheckReport(tuple(sorted(every, key=lambda each: each.kind != "error")))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -142,6 +143,32 @@ class Excerpt:
 #: Called as ``check(mpc, excerpt)``: yields what it finds. Further ones are registered beside these.
 Check = Callable[[MPC, Excerpt], Iterator[Finding]]
 CHECKS: Registry[Check] = Registry("check")
+
+
+def named(finding: Finding, mpc: MPC) -> Finding:
+    """A finding that calls observations and actions by their names, where the MPC's model has some."""
+    layout = mpc.layout
+    known = {"observation": layout.y_labels, "action": layout.u_labels}
+    if not (layout.labels.states or layout.labels.inputs):
+        return finding
+
+    def name(match: re.Match[str]) -> str:
+        labels = known[match["kind"]]
+        numbers = [int(number) for number in re.findall(r"\d+", match["numbers"])]
+        if max(numbers) >= len(labels):
+            return match[0]
+        return " and ".join(labels[i].name for i in numbers)
+
+    def called(text: str) -> str:
+        return re.sub(r"\b(?P<kind>observation|action)s? (?P<numbers>\d+( and \d+)?)\b", name, text)
+
+    return replace(
+        finding,
+        name=called(finding.name),
+        expected=called(finding.expected),
+        actual=called(finding.actual),
+        hint=called(finding.hint),
+    )
 
 
 def predicted(mpc: MPC, x: Array, u: Array) -> Array:

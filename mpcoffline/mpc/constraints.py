@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Self, cast
 
 import casadi as ca
@@ -90,6 +90,8 @@ class Constraint(AnyConstraint):
         name: What a violated constraint is called in a solution's status.
         soft: None for a hard constraint, else the price of violating it.
         terminal: Whether it holds at the end of the horizon.
+        uses_previous: Whether the function is given the inputs of the step before, too, ``(x, u, before, p)``: a limit
+            on how fast inputs may change. The MPC then carries them in its state.
 
     Raises:
         InvalidArgumentError: For a name that is empty or not of the alphabet of names, or a penalty that is negative or
@@ -100,6 +102,7 @@ class Constraint(AnyConstraint):
     name: str = "constraints"
     soft: Penalty | None = None
     terminal: bool = False
+    uses_previous: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         check_name("name of a constraint", self.name)
@@ -113,7 +116,9 @@ class Constraint(AnyConstraint):
                 depend on the plant's states or inputs.
         """
         symbols = [ca.SX.sym("x", sizes.nx), ca.SX.sym("u", sizes.nu), ca.SX.sym("p", sizes.parameters.size)]
-        arguments = symbols[::2] if self.terminal else symbols
+        if self.uses_previous:
+            symbols.insert(2, ca.SX.sym("before", sizes.nu))
+        arguments = symbols[:: len(symbols) - 1] if self.terminal else symbols
         expected = [symbol.numel() for symbol in arguments]
         if isinstance(self.function, ca.Function):
             found = [self.function.numel_in(i) for i in range(self.function.n_in())]
@@ -148,6 +153,7 @@ class Constraint(AnyConstraint):
             "name": self.name,
             "soft": None if self.soft is None else list(self.soft),
             "terminal": self.terminal,
+            "uses_previous": self.uses_previous,
             "function": function_to_json(cast(ca.Function, self.function)),
         }
 
@@ -161,10 +167,12 @@ class Constraint(AnyConstraint):
         if not isinstance(data["terminal"], bool):
             raise FileFormatError("constraint", expected="terminal true or false", actual=repr(data["terminal"])[:80])
         size = sizes.parameters.size
-        inputs = (sizes.nx, size) if data["terminal"] else (sizes.nx, sizes.nu, size)
+        previous = data.get("uses_previous") is True
+        along = (sizes.nx, *((sizes.nu,) * (1 + previous)), size)
+        inputs = (sizes.nx, size) if data["terminal"] else along
         # Not by its own name: CasADi takes no blanks in it.
         function = function_from_json(data["function"], "constraint", inputs=inputs)
-        return cls(function, data["name"], _penalty_from_json(data["soft"]), data["terminal"])
+        return cls(function, data["name"], _penalty_from_json(data["soft"]), data["terminal"], uses_previous=previous)
 
 
 @CONSTRAINTS.register("StateBounds")

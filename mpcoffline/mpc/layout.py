@@ -9,7 +9,7 @@ like any other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.types import Array
 
+from .labels import Label, Labels
 from .signals import Named, Signal, after_the_last, turned
 
 
@@ -43,6 +44,7 @@ class Layout:
         delay: Dead time of each input in sampling steps, ``(nu,)``: the input of step k acts from step k + delay on.
         carried: Past values of each input in the memory, ``(nu,)``, at least ``delay``.
         signals: What comes from outside.
+        labels: What states and inputs are called, for people.
 
     Raises:
         InvalidArgumentError: For two signals of one name, a delay of another length or a negative one, or more states
@@ -54,6 +56,7 @@ class Layout:
     delay: tuple[int, ...]
     carried: tuple[int, ...]
     signals: tuple[Signal, ...] = ()
+    labels: Labels = field(default_factory=Labels)
 
     def __post_init__(self) -> None:
         if len(self.delay) != self.nu or len(self.carried) != self.nu:
@@ -62,6 +65,7 @@ class Layout:
             )
         if any(m < d for m, d in zip(self.carried, self.delay, strict=True)):
             raise InvalidArgumentError("carried", expected=f"at least {self.delay}", actual=str(self.carried))
+        self.labels.fitted(self.n_states, self.nu)
         names = [signal.name for signal in self.signals]
         if len(set(names)) < len(names):
             raise InvalidArgumentError("names of signals", expected="unique names", actual=str(names))
@@ -93,7 +97,7 @@ class Layout:
 
     def with_delay(self, delay: int | Sequence[int] | None) -> Layout:
         """The same with another dead time, and no more memory than that and prices on changes need."""
-        other = Layout.of(self.n_states, self.nu, delay, self.signals)
+        other = replace(Layout.of(self.n_states, self.nu, delay, self.signals), labels=self.labels)
         return other.with_previous() if self.has_previous else other
 
     def with_previous(self) -> Layout:
@@ -119,6 +123,18 @@ class Layout:
     def usual_signals(self) -> Array:
         """The columns of the signals where none is known, ``(ny - n_states,)``."""
         return np.array([value for signal in self.signals for value in signal.usual_values], dtype=np.float64)
+
+    @property
+    def y_labels(self) -> tuple[Label, ...]:
+        """What the coordinates of an observation are called, ``(ny,)``; ``observation 0`` where nothing was said."""
+        states = self.labels.states or tuple(Label(f"observation {i}") for i in range(self.n_states))
+        signals = (Label(name, s.unit) for s in self.signals for name in s.columns)
+        return (*states, *signals)
+
+    @property
+    def u_labels(self) -> tuple[Label, ...]:
+        """What the inputs are called, ``(nu,)``; ``action 0`` where nothing was said."""
+        return self.labels.inputs or tuple(Label(f"action {j}") for j in range(self.nu))
 
     @property
     def n_memory(self) -> int:

@@ -19,6 +19,7 @@ from .component import Component, blocks_from_json
 from .expressions import function_from_json, function_to_json, is_affine, traced
 from .integration_check import IntegrationCheck, Rows, checked, sampled, shortfall
 from .integrators import Scheme, exact_scheme, first_scheme, integrated
+from .labels import Labels
 from .layout import Layout
 from .parameters import Block, Parameter, ParameterSpace
 from .signals import Named, Signal, takes_signals
@@ -58,6 +59,7 @@ class Model(Component):
             that take a fourth argument get their present values by name, ``(x, u, p, d)`` with ``d.price``.
         delay: Dead time of the inputs in sampling steps, one number or one an input: the input of step k acts from step
             k + delay on. None, the default, is not known: the learner looks for it in the data. 0 is known to be none.
+        labels: What states and inputs are called, for messages, tables and comments in C.
 
     Raises:
         InvalidArgumentError: For non-positive sizes or ``dt``, a negative delay or one of another length, dynamics that
@@ -87,8 +89,9 @@ class Model(Component):
         integrator: str = "auto",
         delay: int | Sequence[int] | None = None,
         signals: Sequence[Signal] = (),
+        labels: Labels | None = None,
     ) -> None:
-        layout = Layout.of(nx, nu, delay, signals)
+        layout = replace(Layout.of(nx, nu, delay, signals), labels=labels or Labels())
         if not (np.isfinite(dt) and dt > 0.0):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
         if discrete and integrator != "auto":
@@ -362,6 +365,7 @@ class Model(Component):
             "delay": None if self.delay is None else list(self.delay),
             "previous": self.layout.has_previous,
             "signals": [signal.to_json() for signal in self.layout.signals],
+            "labels": self.layout.labels.to_json(),
             "function": function_to_json(self.plant if self.ode is None else self.ode),
         }
 
@@ -374,6 +378,7 @@ class Model(Component):
         """
         model = cls.__new__(cls)
         layout = Layout.of(data["nx"], data["nu"], data["delay"], [Signal.from_json(s) for s in data["signals"]])
+        layout = replace(layout, labels=Labels.from_json(data.get("labels", {"states": [], "inputs": []})))
         if data["previous"] is True:
             layout = layout.with_previous()
         model.dt, model.delay = float(data["dt"]), None if data["delay"] is None else layout.delay

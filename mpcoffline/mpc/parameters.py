@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core import limits
+from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.text import LONGEST, check_name, check_unit
@@ -43,6 +44,8 @@ class Parameter:
         varies: ``"episode"`` where a model's parameter is another one in every logged episode, as a load or a feed.
             Identification then finds its values, their mean, which the MPC takes, and their spread
             (:class:`~mpcoffline.estimation.EpisodeSpread`).
+        spread: By what share of itself the plant's may differ, 0.3 for 30 %; simulated plants are drawn with it, an
+            MPC does not use it.
 
     Raises:
         InvalidArgumentError: If the value is not finite or lies outside the bounds, the unit has other characters, or
@@ -54,8 +57,10 @@ class Parameter:
     high: ArrayLike = np.inf
     unit: str = ""
     varies: Varies | None = None
+    spread: float = 0.0
 
     def __post_init__(self) -> None:
+        check_number("Parameter spread", self.spread, 0.0, 1.0, open_low=False)
         check_unit("Parameter unit", self.unit)
         _check_varies("Parameter varies", self.varies)
         value, low, high = (np.asarray(v, dtype=np.float64) for v in (self.value, self.low, self.high))

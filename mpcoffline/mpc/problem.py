@@ -79,7 +79,9 @@ class MPC:
     constraints: Constraints | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if getattr(self.stage_cost, "uses_previous", False) and min(self.model.layout.carried) < 1:
+        given = self.constraints if isinstance(self.constraints, Sequence) else (self.constraints,)
+        before = any(getattr(part, "uses_previous", False) for part in (self.stage_cost, *given))
+        if before and min(self.model.layout.carried) < 1:
             object.__setattr__(self, "model", self.model.with_previous())
         check_integers(1, horizon=self.horizon)
         check_limit("horizon", "steps", self.horizon, limits.HORIZON, error=InvalidArgumentError)
@@ -308,8 +310,13 @@ class MPC:
 
     def constraint_expression(self, constraint: Constraint) -> Callable[..., ca.SX]:
         """One of the constraints as ``(x, u, theta) -> h``, or ``(x, theta) -> h`` at the end."""
-        ny = self.ny
-        return lambda x, *others: constraint.function(x[:ny], *others[:-1], self._part("model", others[-1]))
+        ny, before = self.ny, self.layout.previous.tolist() if constraint.uses_previous else []
+
+        def expression(x: ca.SX, *others: ca.SX) -> ca.SX:
+            previous = [x[before]] if constraint.uses_previous else []
+            return constraint.function(x[:ny], *others[:-1], *previous, self._part("model", others[-1]))
+
+        return expression
 
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         size = sum(component.space.size for component in self._components().values())

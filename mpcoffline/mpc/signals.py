@@ -44,6 +44,8 @@ class Signal:
         follows: The name of the clock whose profile it follows.
         profile: c_0, c_1, s_1, c_2, s_2 ... of m, once learned or where they are known.
         persistence: Of a deviation from m, 0 to 1, likewise.
+        low: The least value that it takes, where that is known: for simulations and checks, not for the MPC.
+        high: The largest, likewise.
 
     Raises:
         InvalidArgumentError: For a name that is no identifier, a preview that is negative or longer than a horizon may
@@ -58,6 +60,8 @@ class Signal:
     follows: str | None = None
     profile: tuple[float, ...] = ()
     persistence: float = 1.0
+    low: float = -np.inf
+    high: float = np.inf
 
     def __post_init__(self) -> None:
         check_name("name of a signal", self.name)
@@ -67,6 +71,9 @@ class Signal:
         check_integers(0, preview=self.preview)
         check_limit("preview", "steps", int(self.preview), limits.HORIZON, error=InvalidArgumentError)
         check_number("usual", self.usual, -np.inf, open_low=False)
+        if not self.low < self.high:
+            actual = f"{self.low:g} to {self.high:g}"
+            raise InvalidArgumentError(f"range of signal {self.name}", expected="low < high", actual=actual)
         check_number("persistence", self.persistence, 0.0, 1.0, open_low=False)
         if self.period is not None:
             check_number("period", self.period, 2.0)
@@ -85,14 +92,23 @@ class Signal:
         return 1 + self.preview if self.period is None else 2
 
     @property
+    def columns(self) -> tuple[str, ...]:
+        """What its columns are called, ``(size,)``."""
+        if self.period is not None:
+            return f"cos {self.name}", f"sin {self.name}"
+        return (self.name, *(f"{self.name} in {k} steps" for k in range(1, 1 + self.preview)))
+
+    @property
     def usual_values(self) -> list[float]:
         """A value of each column, ``(size,)``."""
         return [self.usual] * self.size if self.period is None else [1.0, 0.0]
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description."""
-        numbers = {"usual": float(self.usual), "persistence": float(self.persistence), "profile": list(self.profile)}
+        numbers: dict[str, Any] = {"usual": float(self.usual), "persistence": float(self.persistence)}
+        numbers["profile"] = list(self.profile)
         period = None if self.period is None else float(self.period)
+        numbers |= {key: float(v) for key, v in (("low", self.low), ("high", self.high)) if np.isfinite(v)}
         known = {"name": self.name, "unit": self.unit, "preview": int(self.preview), "follows": self.follows}
         return known | numbers | {"period": period}
 

@@ -1,7 +1,11 @@
-"""The plants as an engineer knows them: their nominal controllers."""
+"""Plants as an engineer knows them: their descriptions, simulations and nominal controllers."""
 
 from __future__ import annotations
 
+from .description import Plant
+from .environment import PlantEnv
 from .nominal import nominal_mpc
+from .plant_file import load_plant
+from .quantities import Input, Limit, State
 
-__all__ = ["nominal_mpc"]
+__all__ = ["Input", "Limit", "Plant", "PlantEnv", "State", "load_plant", "nominal_mpc"]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidDataError
 
@@ -62,6 +62,34 @@ def read_arrays(
         starts = ~centring.goes_on(rows) | (terminated[:-1] > 0.0)
         ids = np.concatenate([[0], np.cumsum(starts)]).astype(np.int64)
     return BuiltRows(rows, ids, ny, nu, centring)
+
+
+def packed_blocks(
+    name: str, blocks: Callable[[], Iterable[tuple[Floats, NDArray[np.int64]]]], ny: int, nu: int
+) -> BuiltRows:
+    """Packs rows that come block by block, so that they are never all in float64 at once.
+
+    Args:
+        name: What error messages call the data.
+        blocks: Called twice at most: yields rows ``(B, 2 ny + nu + 2)`` in float64, and the episode of each.
+        ny: Number of observation coordinates.
+        nu: Number of action coordinates.
+
+    Raises:
+        InvalidDataError: For a number that float32 cannot hold.
+    """
+    digits, parts, ids = Digits(ny, nu), [], []
+    for values, episodes in blocks():
+        with np.errstate(over="ignore"):
+            rows = values.astype(np.float32)
+        check_finite(name, rows, ny, nu, episodes)
+        digits.add(values, rows)
+        parts.append(rows)
+        ids.append(episodes)
+    centring = digits.centring
+    if not centring.is_none:
+        parts = [centring.packed(values) for values, _ in blocks()]
+    return BuiltRows(np.concatenate(parts), np.concatenate(ids).astype(np.int64), ny, nu, centring)
 
 
 def types_that_hold(episodes: Sequence[tuple[Floats, Floats, Floats]]) -> tuple[type[Any], type[Any]]:

@@ -1,0 +1,7 @@
+"""From a log to a controller that one dares to switch on: what log and description say of each other."""
+
+from __future__ import annotations
+
+from .log_check import LogCheck, Remark, check_log
+
+__all__ = ["LogCheck", "Remark", "check_log"]

@@ -1,0 +1,109 @@
+"""The page on a log: planted defects are named, a sound log raises no alarm, experiments are as long as needed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted_logs import Case, changed, found_in, heater, is_named, logged
+from typer.testing import CliRunner
+
+from mpcoffline import Input, Plant, State
+from mpcoffline.cli import app
+from mpcoffline.cli.own_plants import _show
+from mpcoffline.core.tables import Table
+from mpcoffline.tune import LogCheck, check_log
+from mpcoffline.tune.experiment import experiments
+
+pytest.importorskip("polars")
+
+LOG = logged("heater", 21, 300)
+KELVIN = Case("kelvin", "heater", lambda: changed(LOG, T=LOG["T"] + 273.15), ("kelvin",))
+STILL = Case("still", "tanks", lambda: logged("tanks", 7, 150, pump=lambda k, x: 3.0), ("input that varies",))
+
+
+def stuck() -> dict[str, object]:
+    T = LOG["T"].copy()
+    T[100:160] = T[100]
+    return changed(LOG, T=T)
+
+
+@pytest.mark.parametrize("case", [KELVIN, STILL, Case("stuck", "heater", stuck, ("stuck at",))], ids=lambda c: c.name)
+def test_a_planted_defect_is_named(case: Case) -> None:
+    problems, advice = found_in(case)
+    assert is_named(case, problems, advice), (problems, advice)
+
+
+def test_a_sound_log_is_worth_tuning_and_the_page_says_what_it_determines() -> None:
+    plant = heater()
+    page = check_log(plant, plant.read(LOG))
+    assert page.problems == []
+    assert page.verdict.startswith("Worth tuning.")
+    assert page.identification is not None
+    text = str(page)
+    for words in (
+        "300 rows, 5 s apart",
+        "What the log covers",
+        "T [°C]",
+        "the log determines all 2",
+        "dead time: none",
+    ):
+        assert words in text
+    (parameters,) = [table for table in page.tables if table.title == "Parameters"]
+    assert [row[-1] for row in parameters.rows] == ["yes", "yes"]
+    assert page.identification.noise.measurement[0] == pytest.approx(0.05, rel=0.3)
+
+
+def test_the_experiment_is_as_long_as_its_noise_asks_for() -> None:
+    plant = Plant(
+        "gain",
+        dt=1.0,
+        states=[State("y")],
+        inputs=[Input("u", low=-1, high=1)],
+        parameters={"b": 1.0, "q": 1.0},
+        dynamics=lambda x, u, p: [p.b * u.u + 0 * p.q],
+        cost={"y": 1.0},
+        discrete=True,
+    )
+    found = experiments(plant.mpc(), ["b", "q"], np.zeros(1), np.ones(1), hold=1)
+    assert found["q"] is None  # nothing depends on it
+    assert found["b"] is not None
+    # y = b u + noise of 1: the deviation of b is 1 / (a sqrt(n)), 10 % of it after n = 100 / a^2
+    assert found["b"].amplitude == pytest.approx(0.8)
+    assert found["b"].steps == pytest.approx(100 / 0.8**2, abs=1)
+
+
+def test_the_command_gives_json_and_refuses_in_a_line(tmp_path: Path) -> None:
+    runner, file, log = CliRunner(), tmp_path / "heater.py", tmp_path / "log.csv"
+    folder = Path(__file__).parents[1] / "helpers"
+    file.write_text(
+        f"import sys\nsys.path.append({str(folder)!r})\nfrom planted_logs import heater\nplant = heater()\n"
+    )
+    columns = (LOG["time"], LOG["T"] + 273.15, LOG["ambient"], LOG["power"])
+    rows = (",".join(f"{v:.7g}" for v in row) for row in zip(*columns, strict=True))
+    log.write_text("\n".join(["s,TI-1,ambient,power", *rows]))
+    missing = runner.invoke(app, ["check", str(file), str(log)])
+    assert missing.exit_code == 1
+    assert "log.csv: column of 'T': expected one among" in " ".join(missing.stderr.split())
+    command = ["check", str(file), str(log), "--column", "T=TI-1", "--time", "s", "--unit", "T=K"]
+    assert runner.invoke(app, [*command, "--where", "mode"]).exit_code == 2
+    done = runner.invoke(app, [*command, "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["worth_tuning"]
+    assert document["log"]["notes"][0] == "T: K to °C"
+    assert [row["determined"] for row in document["tables"]["Parameters"]] == ["yes", "yes"]
+
+
+def test_the_page_is_shown_problems_first(capsys: pytest.CaptureFixture[str]) -> None:
+    page = LogCheck("10 rows", tables=[Table(("parameter", "in the log"), [("k", "1")], title="Parameters")])
+    page.add("problem", "h1", "stuck at 3")
+    page.add("good", "noise", "little")
+    _show(page)
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines == [
+        "Not yet worth tuning: 1 thing is to be looked at first.", "10 rows", "To be mended first", "* h1: stuck at 3",
+        "Good", "* noise: little", "Parameters", "parameter  in the log", "k          1",
+    ]  # fmt: skip
