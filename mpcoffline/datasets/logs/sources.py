@@ -230,20 +230,23 @@ def _told(
 
 def _layout(name: str, lines: list[str]) -> tuple[str, int]:
     """What separates columns, and how many lines come before the header."""
-    best: tuple[int, int, str, int] | None = None
-    for order, separator in enumerate(_SEPARATORS):
-        counts = [len(row) for row in csv.reader(lines, delimiter=separator)]
+    best: tuple[bool, int, int, str, int] | None = None
+    for separator in _SEPARATORS:
+        rows = list(csv.reader(lines, delimiter=separator))
+        counts = [len(row) for row in rows]
         usual, times = Counter(counts[-max(1, len(counts) - 20) :] or [0]).most_common(1)[0]
         if usual < 2:
             continue
         start = next((i for i, n in enumerate(counts) if n == usual), 0)
-        score = (times, usual, separator, start)
-        if best is None or (times, -order) > (best[0], -_SEPARATORS.index(best[2])) or usual > best[1] + 1:
-            best = score
+        # Decimal commas split numbers alike in every row, but not the names above them.
+        named = not any(re.fullmatch(_NUMBER, cell.strip()) for cell in rows[start])
+        found = named, times, usual, separator, start
+        if best is None or found[:2] > best[:2] or (named >= best[0] and usual > best[2] + 1):
+            best = found
     if best is None:
         hint = "Columns are separated by a comma, a semicolon, a tab or a bar."
         raise InvalidDataError(name, expected="a table of several columns", actual="one column", hint=hint)
-    return best[2], best[3]
+    return best[3], best[4]
 
 
 def _is_value(cell: str) -> bool:

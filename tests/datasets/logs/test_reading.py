@@ -42,11 +42,11 @@ def same(table: Any, log: Log, *, steps: int | None = None, atol: float = 1e-6) 
     np.testing.assert_allclose(rows.costs, cost[:n], rtol=1e-5, atol=1e-5)
 
 
-def german(log: Log = LOG) -> str:
+def german(log: Log = LOG, form: str = "g") -> str:
     lines = ["Zeit;h1 [cm];h2 [cm];pump;set_point"]
     for t, *numbers in zip(stamps(log), *log[1:], strict=True):
         stamp = t.astype("M8[ms]").item().strftime("%d.%m.%Y %H:%M:%S")
-        lines.append(";".join([stamp, *(f"{v:g}".replace(".", ",") for v in numbers)]))
+        lines.append(";".join([stamp, *(f"{v:{form}}".replace(".", ",") for v in numbers)]))
     return "\n".join(lines)
 
 
@@ -86,6 +86,7 @@ def other_header(header: str, factors: tuple[float, ...] = (1, 1, 1, 1)) -> str:
 RIGHT: dict[str, str | bytes] = {
     "plain": text(LOG),
     "semicolons and decimal commas": german(),
+    "as many decimal commas in each row": german(form=".4f"),
     "tabs": text(LOG).replace(",", "\t"),
     "byte order mark": b"\xef\xbb\xbf" + text(LOG).encode(),
     "UTF-16": text(LOG).encode("utf-16"),
