@@ -42,6 +42,7 @@ _FIGURES = ("training", "cost", "closed_loop", "phase_portrait")
 @app.command(
     epilog=examples(
         "mpcoffline diagnose learner.zip --dataset mpcoffline/pendulum/ddpg-v0",
+        "mpcoffline diagnose learner.zip --dataset mpcoffline/pendulum/ddpg-v0 --html report.html",
         "mpcoffline diagnose learner.zip --dataset mpcoffline/pendulum/ddpg-v0 --out report.png --json",
     )
 )
@@ -50,6 +51,10 @@ def diagnose(
     dataset: Annotated[str, typer.Option(help="The data set that it was learned from.", show_default=False)],
     out: Annotated[
         Path | None, typer.Option(help="Draw the report here (PDF and PNG).", show_default="none", dir_okay=False)
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="Write the report here, as one page for a browser.", show_default="none", dir_okay=False),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated starts.", min=0)] = 0,
     as_json: Json = False,
@@ -64,17 +69,21 @@ def diagnose(
 
     for file in figure_files(out) if out is not None else ():
         check_out("--out", file)
+    if html is not None:
+        check_out("--html", html)
     fitted = loaded_learner(learner)
     data = load_dataset(dataset)
     with messages.status("Simulating both controllers on models of the log"):
         report = examined(fitted, data, seed=seed)
     files = [] if out is None else report.figure(out)
+    pages = [] if html is None else [report.html(html)]
     if as_json:
-        print_json(json.loads(report.to_json()) | {"files": files})
+        print_json(json.loads(report.to_json()) | {"files": [*files, *pages]})
         return
     say(escape(str(report)))
-    for file in files:
-        say_file("Figure", file)
+    for kind, written in (("Figure", files), ("Page", pages)):
+        for file in written:
+            say_file(kind, file)
 
 
 @app.command(

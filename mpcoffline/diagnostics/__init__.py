@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
+from .background import Labels
 from .diagnosis import diagnose
 from .report import Report
 
-__all__ = ["Report", "diagnose"]
+__all__ = ["Labels", "Report", "diagnose"]

@@ -26,9 +26,18 @@ from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Trials
 
+from .background import (
+    Background,
+    column_lines,
+    episode_line,
+    labels_of,
+    made_by,
+    parameter_lines,
+)
 from .differences import TODAY, Difference
 from .figure import Traces
 from .limits import limit_checks, with_limits
+from .loops import SHOWN_OF, chosen_loops
 from .measures import (
     bound_names,
     fit_errors,
@@ -122,6 +131,7 @@ def diagnose(
     today, rows = clone.replaying(deviations[: around.usual]), around.rows[: around.usual]
     trust = _trust(agreement(around.models, around.cost, table, today, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
+    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, table, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(
@@ -167,6 +177,15 @@ def diagnose(
         ),
         trust=trust,
         limits=limits,
+        background=Background(
+            labels=labels_of(dataset, learned.layout),
+            dt=learned.model.dt,
+            loops=shown,
+            parameters=parameter_lines(nominal, learned, found),
+            columns=column_lines(logged, learned.layout),
+            episodes=episode_line(logged),
+            made_by=made_by(learner, logged, seed),
+        ),
     )
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
     fit = Fit(
@@ -192,7 +211,7 @@ def _tried(
     usual, more = slice(0, around.usual), slice(around.usual, len(around.rows))
     acting = controllers(usual)
     trials = Trials.none(list(acting), around)
-    loops = trials.fill(acting, around, usual)
+    loops = trials.fill(acting, around, usual, SHOWN_OF)
     possible = more.start < more.stop and proposal != FIRST and trials.votes.any()
     if possible and 1.0 < Difference.of(trials, proposal, FIRST).undecided <= more.stop / more.start:
         trials.fill(controllers(more), around, more)

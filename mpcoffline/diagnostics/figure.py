@@ -63,16 +63,16 @@ def draw(
         figure = new_figure(PAGE_WIDTH, _HEIGHT)
         axes = figure.subplots(3, 2)
         figure.suptitle(f"Verdict: {judgement.verdict}", fontsize=10, fontweight="bold", x=0.01, ha="left")
-        _draw_candidates(axes[0, 0], judgement, choice)
-        _draw_costs(axes[0, 1], judgement, trials)
-        _draw_agreement(axes[1, 0], judgement, trials)
-        _draw_distances(axes[1, 1], traces)
-        _draw_value(axes[2, 0], value, traces)
-        _draw_fit(axes[2, 1], fit)
+        draw_candidates(axes[0, 0], judgement, choice)
+        draw_costs(axes[0, 1], judgement, trials)
+        draw_agreement(axes[1, 0], judgement, trials)
+        draw_distances(axes[1, 1], traces)
+        draw_value(axes[2, 0], value, traces)
+        draw_fit(axes[2, 1], fit)
     return figure
 
 
-def _draw_candidates(axes: Axes, judgement: Judgement, trials: Trials) -> None:
+def draw_candidates(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     """A row a candidate: cost minus that of MPC_1, a dot for each model with a vote, a bar of two standard errors."""
     axes.set_title("Candidates, cost minus that of MPC$_{1}$", loc="left")
     rows = candidates(trials)
@@ -101,7 +101,7 @@ def _draw_candidates(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     axes.set_xlabel("dots: models; bar: the median one's")
 
 
-def _draw_costs(axes: Axes, judgement: Judgement, trials: Trials) -> None:
+def draw_costs(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     """Today, MPC_1 and the proposal: what an episode costs."""
     axes.set_title(f"Cost of an episode of {trials.n_steps} steps", loc="left")
     rows = [(name, cost) for name, cost in costs_of(judgement, trials) if np.isfinite(cost).all()]
@@ -122,7 +122,7 @@ def _draw_costs(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     axes.set_xlabel("as models and log let expect")
 
 
-def _draw_agreement(axes: Axes, judgement: Judgement, trials: Trials) -> None:
+def draw_agreement(axes: Axes, judgement: Judgement, trials: Trials) -> None:
     """Each start: what the log cost from there, and its controller's clone on the models."""
     axes.set_title("Models against the log", loc="left")
     known = np.isfinite(trials.returns) & whole_episodes(trials)
@@ -153,7 +153,7 @@ def _name(name: str) -> str:
     return "today (clone)" if name == TODAY else controller_label(textwrap.shorten(name, 26, placeholder="..."))
 
 
-def _draw_distances(axes: Axes, traces: Traces) -> None:
+def draw_distances(axes: Axes, traces: Traces) -> None:
     """How far both controllers are from where they end, over the steps: median and quartiles over the starts."""
     axes.set_title("Closed loops on the identified model", loc="left")
     everything = np.concatenate([traces.nominal_states, traces.learned_states]).reshape(
@@ -183,7 +183,7 @@ def _draw_distances(axes: Axes, traces: Traces) -> None:
     axes.legend(loc="upper right", ncols=2, fontsize=7)
 
 
-def _draw_value(axes: Axes, value: ValueCheck, traces: Traces) -> None:
+def draw_value(axes: Axes, value: ValueCheck, traces: Traces) -> None:
     """V against measured returns."""
     axes.set_title("V of the last episodes", loc="left")
     predicted, measured = traces.value
@@ -202,7 +202,7 @@ def _draw_value(axes: Axes, value: ValueCheck, traces: Traces) -> None:
     axes.set_ylabel("V")
 
 
-def _draw_fit(axes: Axes, fit: tuple[RegionError, ...]) -> None:
+def draw_fit(axes: Axes, fit: tuple[RegionError, ...]) -> None:
     """The error of (FIT) before and after, by region."""
     names = [part.name.replace("V ", "").replace(" quarter", "") for part in fit]
     places, width = np.arange(len(names)), 0.38

@@ -12,15 +12,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mpcoffline.core.archive import plain
+from mpcoffline.core.outputs import write_file
 from mpcoffline.core.text import listed
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.plotting import save_figure
 from mpcoffline.simulation.trials import Trials
 
+from .background import Background, Labels
 from .differences import TODAY, candidates
 from .figure import Traces, draw
 from .limits import LimitCheck
 from .measures import GoalCheck, LagCheck, RegionError, ValueCheck
+from .page import page_of
 from .stability import TheoremCheck, WeightCheck
 from .verdict import Judgement, Verdict, costs_of
 
@@ -96,6 +99,7 @@ class Report:
         traces: What the figure shows besides; not in the JSON form.
         trust: How well the models reproduce what the log itself cost; None where none has a vote.
         limits: How often each limit of the MPC that was given is violated.
+        background: What :meth:`html` shows besides; not in the JSON form.
     """
 
     judgement: Judgement
@@ -120,6 +124,7 @@ class Report:
     traces: Traces = field(repr=False, compare=False)
     trust: Trust | None = None
     limits: tuple[LimitCheck, ...] = ()
+    background: Background | None = field(default=None, repr=False, compare=False)
 
     @property
     def verdict(self) -> Verdict:
@@ -223,7 +228,7 @@ class Report:
 
     def to_json(self) -> str:
         """The report as JSON text; what is not finite becomes null."""
-        fields = ("trials", "choice", "traces", "judgement")
+        fields = ("trials", "choice", "traces", "background", "judgement")
         judgement = {name: value for name, value in vars(self.judgement).items() if name not in ("first", "today")}
         data = judgement | {name: value for name, value in vars(self).items() if name not in fields}
         data = {name: _as_data(value) for name, value in data.items()}
@@ -257,6 +262,27 @@ class Report:
             The files.
         """
         return save_figure(self.plot(), Path(path))
+
+    def html(self, path: str | PathLike[str], *, title: str = "", labels: Labels | None = None) -> Path:
+        """Writes the report as one page of HTML, for a browser and for paper, that loads nothing from elsewhere.
+
+        It begins with the verdict and its reasons; then what would change (costs, closed loops from the same starts),
+        candidates, parameters before and after, how far models and data can be trusted, notes, versions and hashes.
+        Equal reports give equal pages.
+
+        Args:
+            path: The file; what was there is replaced, its folder made where it is missing.
+            title: The heading; by default the name of the plant, where that is known.
+            labels: Names and units of states, inputs and cost, where they are known better than from the data set.
+
+        Returns:
+            The file.
+
+        Raises:
+            InvalidArgumentError: For labels of another number of columns.
+            StorageError: If it cannot be written.
+        """
+        return write_file(path, page_of(self, title=title, labels=labels))
 
 
 def _as_data(value: Any) -> Any:

@@ -24,6 +24,7 @@ from .style import (
     paper_style,
     save_figure,
 )
+from .svg import inline_svg
 from .training import training_figure
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "draw_bars",
     "draw_signal",
     "draw_weights",
+    "inline_svg",
     "legend_handles",
     "line_of",
     "loop_figure",

@@ -83,9 +83,11 @@ class Trials:
         parts = cost, second, lost, rows, returns, around.begun, judged, around.n_before + around.n_steps
         return cls(tuple(names), models.names, models.votes, *parts)
 
-    def fill(self, controllers: Mapping[str, Controller], around: Surroundings, starts: slice) -> dict[str, Episodes]:
-        """Adds what controllers do from some of the starts."""
-        done = dict(zip(controllers, around.act(list(controllers.values()), starts), strict=True))
+    def fill(
+        self, controllers: Mapping[str, Controller], around: Surroundings, starts: slice, kept: int = 0
+    ) -> dict[str, Episodes]:
+        """Adds what controllers do from some of the starts; ``kept`` as :meth:`Surroundings.act` has it."""
+        done = dict(zip(controllers, around.act(list(controllers.values()), starts, kept), strict=True))
         for name, episodes in done.items():
             k, before = self.names.index(name), around.before[starts]
             self.cost[k, :, starts], self.second[k, :, starts] = episodes.cost + before, episodes.second + before
@@ -165,6 +167,8 @@ class Episodes:
         lost: Likewise.
         states: States with the first model, past inputs included, ``(starts, T + 1, nx)``.
         actions: Inputs with the first model, ``(starts, T, nu)``.
+        states_kept: States with every model, ``(models, kept, T + 1, nx)``, of the first starts, as many as were asked.
+        actions_kept: Inputs with every model, ``(models, kept, T, nu)``.
     """
 
     cost: Array
@@ -172,6 +176,8 @@ class Episodes:
     lost: NDArray[np.bool_]
     states: Array
     actions: Array
+    states_kept: Array
+    actions_kept: Array
 
 
 class Surroundings:
@@ -227,7 +233,7 @@ class Surroundings:
         other.models, other.disturbances = self.models.some(models), self.disturbances[models]
         return other
 
-    def act(self, controllers: Sequence[Controller], starts: slice = slice(None)) -> list[Episodes]:
+    def act(self, controllers: Sequence[Controller], starts: slice = slice(None), kept: int = 0) -> list[Episodes]:
         """Closed loops of controllers on all models from all starts; all decisions of one in a step are one batch.
 
         A state that runs away stays where it was and costs as much as the dearest logged transition from then on; an
@@ -236,6 +242,7 @@ class Surroundings:
         Args:
             controllers: What acts, each by itself.
             starts: From which starts; all by default.
+            kept: Of how many of them, the first ones, states and inputs are kept with every model.
         """
         ny, n, m, c = self._layout.ny, self._layout.n_states, len(self.models), len(controllers)
         begun, signals = self.starts[starts], self.signals[starts]
@@ -244,6 +251,7 @@ class Surroundings:
         x = np.broadcast_to(begun, (*shape, begun.shape[1])).copy()
         lost, over = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
+        states_kept, actions_kept = [x[:, :, :kept].copy()], []
         courses = [self._course(controller, x[:, i]) for i, controller in enumerate(controllers)]
         for k in range(self.n_steps):
             seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
@@ -266,9 +274,15 @@ class Surroundings:
             x[..., n:ny] = signals[:, k]
             states.append(x[0].copy())
             actions.append(u[0])
+            states_kept.append(x[:, :, :kept].copy())
+            actions_kept.append(u[:, :, :kept].copy())
         lost |= over
         parts = np.stack(states, axis=2), np.stack(actions, axis=2)
-        return [Episodes(total[:, i], second[:, i], lost[:, i], *(each[i] for each in parts)) for i in range(c)]
+        kept_parts = np.stack(states_kept, axis=3), np.stack(actions_kept, axis=3)
+        return [
+            Episodes(total[:, i], second[:, i], lost[:, i], *(e[i] for e in parts), *(e[:, i] for e in kept_parts))
+            for i in range(c)
+        ]
 
     def _course(self, controller: Controller, x: Array) -> Course | None:
         """What a controller is given of the time before: the inputs that were applied, as in midst of an episode."""

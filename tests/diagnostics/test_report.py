@@ -9,54 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from invented_report import GAINS, GOOD, report_of
 from invented_trials import trials
 
-from mpcoffline.diagnostics import Report
-from mpcoffline.diagnostics.figure import Traces
-from mpcoffline.diagnostics.measures import GoalCheck, LagCheck, RegionError, ValueCheck
-from mpcoffline.diagnostics.report import PredictionCheck
-from mpcoffline.diagnostics.stability import TheoremCheck, WeightCheck
-from mpcoffline.diagnostics.verdict import decide
-from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
-
-GAINS = {
-    "full fit": [52.0, 50.0, 55.0, 51.0, 53.0, 49.0, 54.0, -400.0],
-    "identified + V": [30.0, 28.0, 33.0, 31.0, 20.0, 29.0, 30.0, 31.0],
-    "identified + nominal cost": [10.0, -3.0, 12.0, 11.0, 9.0, 9.0, 10.0, 11.0],
-}
-
-
-def report_of(tried: Trials, name: str = "full fit", choice: Trials | None = None) -> Report:
-    """Of trials; everything else is made up."""
-    rng = np.random.default_rng(0)
-    states = np.cumsum(rng.normal(size=(8, 51, 2)), axis=1) * np.exp(-0.1 * np.arange(51))[:, None]
-    value = np.sort(rng.normal(size=(2, 100)), axis=1)
-    return Report(
-        judgement=decide(tried, name, choice=choice),
-        trials=tried,
-        choice=choice,
-        notes=("A note.",),
-        cost_r2=0.998,
-        value=ValueCheck(100, 0.9, -0.1, 0.05, 0.9),
-        fit=tuple(RegionError(part, 0.5, 0.01) for part in ("all data", "V lowest quarter", "V highest quarter")),
-        prediction=PredictionCheck(0.5, 0.01, 0.02, ()),
-        theorem=TheoremCheck(0.8, 0.02, (0.9, 0.5)),
-        weights=(WeightCheck("W", (0.1, 1.0), (0.2, 2.0)),),
-        at_bounds=tuple(f"model.a[{i}]" for i in range(40)),
-        outside_support=0.01,
-        lag=LagCheck(0.01, 0.5),
-        noise=NoiseEstimate(np.zeros(2), np.zeros(2), np.ones(2), "repeated"),
-        goal=GoalCheck(0.1, False),
-        failed_solves=(0.0, 0.001),
-        findings=("Logged cost: known.",),
-        n_rows=10_000,
-        n_episodes=100,
-        traces=Traces(states, 0.5 * states, value, np.zeros(2)),
-    )
-
-
-GOOD = trials(GAINS, today=140.0, clone=136.0, spread=30.0, noise=8.0)
 
 
 def test_the_text_has_the_table_the_candidates_and_how_far_models_and_log_agree() -> None:

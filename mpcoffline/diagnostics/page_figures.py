@@ -1,0 +1,154 @@
+"""The pictures of a report's page: small panels, each readable on a phone, in the colours of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpcoffline.core.types import Array
+from mpcoffline.plotting import STYLES, controller_label, inline_svg, line_of, new_figure, paper_style
+
+from . import figure
+from .background import Background
+from .loops import Loop
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from .report import Report
+
+_WIDTH, _HEIGHT, _LOW = 3.5, 2.35, 1.75  # inches
+_MOST_QUANTITIES = 6  # of states, and of inputs, in the closed loops
+_MOST_POINTS = 200  # of a curve
+_TODAY = "#000000"
+#: The figures' colours by those of the page, which are others in the dark.
+COLORS = {
+    STYLES["MPC_1"].color: "var(--first)",
+    STYLES["MPC_3"].color: "var(--proposal)",
+    "#767676": "var(--grey)",
+    "#E6E6E6": "var(--grid)",
+}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure in a page.
+
+    Attributes:
+        svg: The element.
+        caption: What stands below it.
+    """
+
+    svg: str
+    caption: str
+
+
+def panels(report: Report) -> dict[str, Picture]:
+    """The pictures of the figures in a report, by name."""
+    judgement, trials, traces = report.judgement, report.trials, report.traces
+    choice = report.choice or trials
+    drawn: dict[str, tuple[Callable[[Axes], None], str]] = {
+        "costs": (
+            lambda axes: figure.draw_costs(axes, judgement, trials),
+            "Cost of an episode: the mean that models and log let expect, from its lowest to its highest.",
+        ),
+        "candidates": (
+            lambda axes: figure.draw_candidates(axes, judgement, choice),
+            "Cost minus that of MPC_1, less is better: a dot for each model that predicts the log, and the median"
+            " model's with two standard errors.",
+        ),
+        "agreement": (
+            lambda axes: figure.draw_agreement(axes, judgement, trials),
+            "Each start: what the log cost from there, and what a clone of its controller costs on the models (median,"
+            " and from the tenth to the ninetieth percentile). On the line, they agree.",
+        ),
+        "distances": (
+            lambda axes: figure.draw_distances(axes, traces),
+            "Distance to the goal on the identified model, over all starts: median and quartiles.",
+        ),
+        "value": (
+            lambda axes: figure.draw_value(axes, report.value, traces),
+            "V against the discounted cost that was measured from the same states of the last episodes.",
+        ),
+        "fit": (
+            lambda axes: figure.draw_fit(axes, report.fit),
+            "Regression error of (FIT), before and after, in all data and by quarters of V.",
+        ),
+    }
+    return {name: _picture(f"f-{name}", draw, caption) for name, (draw, caption) in drawn.items()}
+
+
+def loop_panels(loop: Loop, k: int, background: Background) -> Iterator[Picture]:
+    """The closed loops from one start: a picture for each of the quantities that tell the controllers apart.
+
+    Args:
+        loop: What happens.
+        k: Its number, for the ids.
+        background: Names and sampling time.
+    """
+    labels = background.labels
+    rows = [(labels.states, loop.states, loop.states_on, False), (labels.inputs, loop.actions, loop.actions_on, True)]
+    for kind, (names, logged, on, held) in enumerate(rows):
+        for i in _telling(logged, list(on.values())):
+            curves = {name: values[..., i] for name, values in on.items()}
+            caption = f"{names[i]}: {_range_in_words(logged[:, i], curves)}"
+            yield _picture(
+                f"l{k}-{kind}-{i}", _Panel(names[i], logged[:, i], curves, background.dt, held), caption, _LOW
+            )
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """One quantity over time: the log's, and each controller's median model in the band of all models."""
+
+    name: str
+    logged: Array
+    curves: dict[str, Array]
+    dt: float
+    held: bool
+
+    def __call__(self, axes: Axes) -> None:
+        n = len(self.logged)
+        step = max(1, n // _MOST_POINTS)
+        times, shape = self.dt * np.arange(n)[::step], "post" if self.held else None
+        for k, (name, values) in enumerate(self.curves.items()):
+            style = STYLES["MPC_1" if k == 0 else "MPC_3"]
+            low, middle, high = (of(values, axis=0)[::step] for of in (np.min, np.median, np.max))
+            axes.fill_between(times, low, high, step=shape, color=style.color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
+            drawn = "steps-post" if self.held else "default"
+            axes.plot(times, middle, drawstyle=drawn, label=controller_label(name), **line_of(style))
+        if np.isfinite(self.logged).any():
+            drawn = "steps-post" if self.held else "default"
+            axes.plot(
+                times, self.logged[::step], ":", drawstyle=drawn, color=_TODAY, linewidth=1.2, label="today (log)"
+            )
+        axes.set_title(self.name if self.name.startswith("$") else self.name.replace("$", r"\$"), loc="left")
+        axes.set_xlabel("time [s]")
+        axes.margins(x=0.0)
+
+
+def _telling(logged: Array, on: list[Array]) -> list[int]:
+    """Which quantities are shown, in their order: those in which the controllers differ most, in spreads."""
+    everything = np.concatenate([values.reshape(-1, values.shape[-1]) for values in on])
+    spread = everything.std(axis=0)
+    apart = sum(np.abs(values.mean(axis=0) - on[0].mean(axis=0)).mean(axis=0) for values in on)
+    order = np.argsort(-np.divide(apart, spread, out=np.zeros_like(spread), where=spread > 0.0), kind="stable")
+    return sorted(order[:_MOST_QUANTITIES].tolist())
+
+
+def _range_in_words(logged: Array, curves: dict[str, Array]) -> str:
+    """For those who do not see the curves: where each ends."""
+    parts = [f"{name} ends at {np.median(values[:, -1]):.3g}" for name, values in curves.items()]
+    known = logged[np.isfinite(logged)]
+    return "; ".join([*parts, f"the log at {known[-1]:.3g}"] if len(known) else parts) + "."
+
+
+def _picture(key: str, draw: Callable[[Axes], None], caption: str, height: float = _HEIGHT) -> Picture:
+    with paper_style():
+        drawn = new_figure(_WIDTH, height)
+        axes = drawn.subplots()
+        draw(axes)
+        return Picture(inline_svg(drawn, key, caption, COLORS), caption)
