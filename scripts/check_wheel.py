@@ -43,6 +43,7 @@ for env_id in mpcoffline.envs.ENV_IDS:
 for row in mpcoffline.list_datasets():
     assert row.where == "shipped", row
 assert mpcoffline.load_dataset("mpcoffline/linear/ddpg-v0").total_episodes == 500
+assert (pathlib.Path(mpcoffline.__file__).parent / "diagnostics" / "page.html.jinja").is_file(), "no template"
 print("mpcoffline", mpcoffline.__version__, "works from its wheel")
 """
 

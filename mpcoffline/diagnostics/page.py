@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ _DOCS = "https://arxiv.org/abs/2301.01667"
 _MOST_PARAMETERS = 200
 _UNKNOWN = "unknown"
 _EXPONENT = re.compile(r"e([+-]?)0*(\d+)")
+_MINUS = re.compile(r"(?<![\w.)\]-])-(?=\d)")  # in front of a number, not inside a word
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _GROUPS = {"model": "Model", "cost": "Stage cost", "terminal": "Terminal cost", "reference": "Reference"}
 _SHORT = {"recommend": "good", "try with care": "care", "keep MPC_1": "keep"}
@@ -75,7 +76,7 @@ def page_of(report: Report, *, title: str = "", labels: Labels | None = None) ->
 
 
 def _template() -> jinja2.Template:
-    text = resources.files(__package__).joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    text = resources.files("mpcoffline.diagnostics").joinpath(_TEMPLATE).read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -123,7 +124,7 @@ def share(value: float) -> str:
 
 def prose(text: str) -> str:
     """The report's sentences as a page sets them."""
-    return visible(text).replace(" +- ", " ± ")
+    return _MINUS.sub("−", visible(text).replace(" +- ", " ± ").replace(" -> ", " → "))
 
 
 # ---------------------------------------------------------------- tables
@@ -214,10 +215,13 @@ def _noise(report: Report) -> list[dict[str, str]]:
     ]
 
 
+def _numbers(values: Iterable[float]) -> str:
+    return ", ".join(number(each, 3) for each in values)
+
+
 def _checks(report: Report) -> dict[str, list[tuple[str, str]]]:
     """The report's other figures, by what they are about."""
     p, v, t = report.prediction, report.value, report.theorem
-    numbers: Callable[[Iterable[float]], str] = lambda values: ", ".join(number(each, 3) for each in values)  # noqa: E731
     value = (
         f"correlation {number(v.correlation, 2)} (a regression has {number(v.attainable, 2)}), bias"
         f" {number(v.bias, 2, True)} standard deviations, above by more than one in {share(v.above)} of {v.n} states"
@@ -240,8 +244,8 @@ def _checks(report: Report) -> dict[str, list[tuple[str, str]]]:
             ("V against measured returns", value),
             ("V along model rollouts, of its range in the data", number(t.value_growth, 3)),
             ("Rollouts outside the data", share(t.outside)),
-            ("Closed-loop eigenvalues at the reference (moduli)", numbers(t.eigenvalues) or _UNKNOWN),
-            *((f"Eigenvalues of {w.name}", f"{numbers(w.before)} → {numbers(w.after)}") for w in report.weights),
+            ("Closed-loop eigenvalues at the reference (moduli)", _numbers(t.eigenvalues) or _UNKNOWN),
+            *((f"Eigenvalues of {w.name}", f"{_numbers(w.before)} → {_numbers(w.after)}") for w in report.weights),
         ],
         "solver": [
             ("Problems of MPC_1 not solved at first", share(report.failed_solves[0])),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -113,15 +113,15 @@ class _Panel:
     def __call__(self, axes: Axes) -> None:
         n = len(self.logged)
         step = max(1, n // _MOST_POINTS)
-        times, shape = self.dt * np.arange(n)[::step], "post" if self.held else None
+        times = self.dt * np.arange(n)[::step]
+        shape: Literal["post"] | None = "post" if self.held else None
+        drawn = "steps-post" if self.held else "default"
         for k, (name, values) in enumerate(self.curves.items()):
             style = STYLES["MPC_1" if k == 0 else "MPC_3"]
             low, middle, high = (of(values, axis=0)[::step] for of in (np.min, np.median, np.max))
-            axes.fill_between(times, low, high, step=shape, color=style.color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
-            drawn = "steps-post" if self.held else "default"
+            axes.fill_between(times, low, high, step=shape, color=style.color, alpha=0.2, linewidth=0)
             axes.plot(times, middle, drawstyle=drawn, label=controller_label(name), **line_of(style))
         if np.isfinite(self.logged).any():
-            drawn = "steps-post" if self.held else "default"
             axes.plot(
                 times, self.logged[::step], ":", drawstyle=drawn, color=_TODAY, linewidth=1.2, label="today (log)"
             )

@@ -6,7 +6,7 @@ import io
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -15,7 +15,7 @@ _FONT = "system-ui, 'DejaVu Sans', sans-serif"
 _REFERENCE = re.compile(r"url\(#([^)]+)\)")
 _BLACK = re.compile(r"#000000\b", re.IGNORECASE)
 _FAMILY = re.compile(r"('[^']*'|sans-serif)(, ('[^']*'|[\w-]+))+")
-_POINT = 4.0 / 3.0  # CSS pixels
+_WIDEST = 1.9  # CSS pixels a point: letters are as large as the page's, no larger
 
 
 def inline_svg(figure: Figure, key: str, text: str, colors: Mapping[str, str] | None = None) -> str:
@@ -36,17 +36,19 @@ def inline_svg(figure: Figure, key: str, text: str, colors: Mapping[str, str] | 
     figure.patch.set_alpha(0.0)
     for axes in figure.axes:
         axes.patch.set_alpha(0.0)
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": key, "svg.image_inline": True}):
+    rc_context: Any = mpl.rc_context  # its stubs name every key
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": key}):
         metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         figure.savefig(content, format="svg", metadata=metadata)
     root = ET.fromstring(content.getvalue())
     for element in root.iter():
         _freed(element, key, colors or {})
     for parent in list(root.iter()):
-        for child in [c for c in parent if c.tag == "metadata"]:
+        for child in [c for c in parent if c.tag in ("metadata", "style")]:  # a style would be the whole page's
             parent.remove(child)
     _, _, width, _ = (float(v) for v in root.attrib["viewBox"].split())
-    root.attrib.update(role="img", style=f"width:100%;max-width:{_POINT * width:.0f}px;height:auto")
+    look = "stroke-linejoin:round;stroke-linecap:butt"  # what the style said
+    root.attrib.update(role="img", style=f"{look};width:100%;max-width:{_WIDEST * width:.0f}px;height:auto")
     root.attrib["aria-label"] = text
     for name in ("width", "height", "version"):
         root.attrib.pop(name, None)

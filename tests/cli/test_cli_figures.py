@@ -98,6 +98,10 @@ class MadeUpReport:
         path.write_bytes(b"a figure")
         return [path]
 
+    def html(self, path: Path) -> Path:
+        path.write_text("a page")
+        return path
+
 
 @pytest.mark.usefixtures("shipped")
 def test_diagnose_prints_the_report_or_its_json(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,6 +112,12 @@ def test_diagnose_prints_the_report_or_its_json(files: Path, monkeypatch: pytest
     assert text.stdout.splitlines() == ["Verdict: recommend [of a learner]", "Figure: report.png"]
     document = json.loads(call(*arguments, "--json").stdout)
     assert document == {"verdict": "recommend", "files": ["report.png"]}
+    both = (*arguments, "--html", "report.html")
+    assert call(*both).stdout.splitlines()[1:] == ["Figure: report.png", "Page: report.html"]
+    assert json.loads(call(*both, "--json").stdout)["files"] == ["report.png", "report.html"]
+    refused = call(*arguments, "--html", "nowhere/report.html")
+    assert refused.exit_code != 0
+    assert "--html" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ import mpcoffline
 from mpcoffline import OfflineMPCLearner, TransitionTable
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
 from mpcoffline.diagnostics import Report, diagnose
+from mpcoffline.diagnostics.page import page_of
 from mpcoffline.estimation.smoothing import with_measurement_noise
 from mpcoffline.mpc import MPC
 
@@ -53,6 +54,28 @@ def test_a_fit_that_repairs_a_wrong_model_is_recommended(good: Report) -> None:
     assert good.goal is not None
     assert good.goal.share > 0.01
     assert (good.n_rows, good.n_episodes) == (1_600, 40)
+
+
+def test_the_page_shows_loops_from_the_log_parameters_and_where_they_are_from(good: Report) -> None:
+    found = good.background
+    assert found is not None
+    assert [loop.why for loop in found.loops][:2] == ["A usual start: the median gain", "Where it gains most"]
+    for loop in found.loops:
+        np.testing.assert_array_equal(loop.states[0], LOG.observations[loop.row])
+        np.testing.assert_array_equal(loop.actions[0], LOG.actions[loop.row])
+        assert list(loop.states_on) == ["MPC_1", good.judgement.proposal]
+        for states in loop.states_on.values():
+            assert states.shape == (good.trials.votes.sum(), 41, 2)
+            np.testing.assert_allclose(states[:, 0], np.broadcast_to(loop.states[0], states[:, 0].shape), rtol=1e-6)
+    assert found.episodes == (40, 40, 40, 0)
+    assert [column.high for column in found.columns[:2]] == pytest.approx(LOG.observations.max(axis=0))
+    b = {line.name: line for line in found.parameters if line.name.startswith("model.B")}
+    assert [line.before for line in b.values()] == pytest.approx(WRONG.values["model.B"].ravel())
+    assert [line.found for line in b.values()] == pytest.approx(lq_plant.B.ravel(), abs=1e-4)
+    assert len(dict(found.made_by)["SHA-256 of the learned theta"]) == 64
+    page = page_of(good)
+    assert page.count("row ") >= len(found.loops)
+    assert all(f">{line.name}<" in page for line in found.parameters)
 
 
 def test_text_and_json_say_the_same(good: Report) -> None:

@@ -16,7 +16,7 @@ from invented_trials import trials
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.diagnostics import Labels
 from mpcoffline.diagnostics.loops import _chosen
-from mpcoffline.diagnostics.page import number, page_of, pair
+from mpcoffline.diagnostics.page import number, page_of, pair, prose
 
 ODD = '<script>alert("1")</script>&amp;'
 
@@ -35,11 +35,11 @@ def test_the_page_holds_verdict_reasons_candidates_parameters_and_hashes(soup: B
     report, text = report_of(GOOD), " ".join(soup.get_text(" ").split())
     assert soup.find(id="verdict").get_text() == "Verdict: recommend"
     for reason in report.reasons:
-        assert reason.replace(" +- ", " ± ") in text
+        assert prose(reason) in text
     for name in ("full fit", "identified + V", "identified + nominal cost", "today (clone)"):
         assert soup.find("th", string=name, scope="row")
     rows = {row.th.get_text(): [cell.get_text() for cell in row("td")] for row in soup("tr") if row.th and row.td}
-    assert rows["model.area"] == ["0.3", "0.412 ± 0.004", "0.4", "cm2"]
+    assert rows["model.area"] == ["0.3", "0.4123 ± 0.004", "0.4", "cm2"]
     assert rows[f"model.{ODD}"][1].startswith("not determined")
     assert rows["stage_cost.W[0,0]"] == ["1", "1.25·10⁻⁷", ""]
     assert rows["stage_cost.new"][0] == "–"
@@ -117,6 +117,7 @@ def test_numbers_are_written_for_readers() -> None:
     assert pair(12.3456, 0.21) == "12.35 ± 0.21"
     assert pair(-50.123, 1.2, sign=True) == "−50.1 ± 1.2"
     assert pair(0.001, 5.0) == "0.001 ± 5"
+    assert prose("a +- 2 of -3 (1 -> -2), 10-step x[-1]") == "a ± 2 of −3 (1 → −2), 10-step x[−1]"
     assert pair(3.0, np.inf) == "3 (doubt unknown)"
 
 

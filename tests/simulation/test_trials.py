@@ -38,7 +38,7 @@ def place(mpc: MPC, log: TransitionTable, rows: list[int], n_steps: int, members
 
 def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     around = place(TRUE_MPC, LOG, [0, 30, 60, 90, 120], 40)
-    done = around.act([MPCPolicy(TRUE_MPC)])[0]
+    done = around.act([MPCPolicy(TRUE_MPC)], kept=2)[0]
     x, expected = LOG.observations[[0, 30, 60, 90, 120]].astype(np.float64), np.zeros(5)
     for _ in range(40):
         u = x @ BEST.K.T
@@ -48,8 +48,12 @@ def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     np.testing.assert_allclose(done.second, done.cost)  # a quadratic is exact: there is no other opinion
     assert not done.lost.any()
     assert done.states.shape == (5, 41, 2)
+    np.testing.assert_array_equal(done.states_kept[0], done.states[:2])
+    np.testing.assert_array_equal(done.actions_kept[0], done.actions[:2])
+    assert done.states_kept.shape == (len(around.models), 2, 41, 2)
     some = around.act([MPCPolicy(TRUE_MPC)], slice(1, 3))[0]
     np.testing.assert_allclose(some.cost, done.cost[:, 1:3], rtol=1e-6)
+    assert some.states_kept.shape[1] == 0
 
 
 def test_a_disturbance_of_the_log_meets_every_controller_again() -> None:
