@@ -64,6 +64,7 @@ def page_of(report: Report, *, title: str = "", labels: Labels | None = None) ->
         costs=_costs(report),
         candidates=_candidates(report),
         models=_models(report),
+        limits=_limits(report),
         groups=() if background is None else _parameters(background.parameters),
         columns=() if background is None else _columns(report),
         episodes=None if background is None else background.episodes,
@@ -163,6 +164,21 @@ def _models(report: Report) -> list[dict[str, Any]]:
     return [
         {"name": name, "asked": bool(vote), "difference": said.get(name, "–")}
         for name, vote in zip(trials.models, trials.votes, strict=True)
+    ]
+
+
+def _limits(report: Report) -> list[dict[str, Any]]:
+    """How often, and by how much at most, the log, MPC_1 and the proposal violate each limit."""
+    return [
+        {
+            "name": f"{each.name} ({each.kind})",
+            "worse": each.worse,
+            "cells": [
+                "kept" if not s else f"{share(s)} of the steps, by up to {number(most, 3)}"
+                for s, most in zip(each.shares, each.largest, strict=True)
+            ],
+        }
+        for each in report.limits
     ]
 
 

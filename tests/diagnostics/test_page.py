@@ -15,6 +15,7 @@ from invented_trials import trials
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.diagnostics import Labels
+from mpcoffline.diagnostics.limits import LimitCheck
 from mpcoffline.diagnostics.loops import _chosen
 from mpcoffline.diagnostics.page import number, page_of, pair, prose
 
@@ -23,7 +24,10 @@ ODD = '<script>alert("1")</script>&amp;'
 
 @pytest.fixture(scope="module")
 def page() -> str:
-    return page_of(replace(report_of(GOOD), background=background(odd=ODD), notes=(f"A note on {ODD}.",)), title=ODD)
+    report = replace(report_of(GOOD), background=background(odd=ODD), notes=(f"A note on {ODD}.",))
+    return page_of(
+        replace(report, limits=(LimitCheck(ODD, "hard", (0.1, 0.0, 0.25), (2.0, 0.0, 0.5), True),)), title=ODD
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +49,8 @@ def test_the_page_holds_verdict_reasons_candidates_parameters_and_hashes(soup: B
     assert rows["stage_cost.new"][0] == "–"
     assert rows["today, as logged"][1] == "140"
     assert rows["SHA-256 of the learned theta"] == ["0123456789abcdef" * 4]
+    limit = rows[f"{ODD} (hard)"]
+    assert limit == ["10 % of the steps, by up to 2", "kept", "25 % of the steps, by up to 0.5"]
     assert "in EUR" in text
     assert f"A note on {ODD}." in text
 
