@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .background import Labels
+from .background import Names
 from .diagnosis import diagnose
 from .report import Report
 
-__all__ = ["Labels", "Report", "diagnose"]
+__all__ = ["Names", "Report", "diagnose"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -29,7 +30,7 @@ _PACKAGES = ("mpcoffline", "numpy", "scipy", "casadi", "torch", "gymnasium", "st
 
 
 @dataclass(frozen=True)
-class Labels:
+class Names:
     """Names, with units, of what figures and tables show; plain text of any alphabet.
 
     Attributes:
@@ -45,7 +46,7 @@ class Labels:
     plant: str = ""
 
     @classmethod
-    def numbered(cls, layout: Layout) -> Labels:
+    def numbered(cls, layout: Layout) -> Names:
         """Where nothing is known: ``"state 1"``; signals have names."""
         states = tuple(f"state {i + 1}" for i in range(layout.n_states))
         signals = tuple(
@@ -103,7 +104,7 @@ class Background:
     """What a page shows beside a report's own figures.
 
     Attributes:
-        labels: Names and units.
+        names: Names and units.
         dt: Sampling time, in the model's unit of time.
         loops: Closed loops from a few starts.
         parameters: Those of the MPC.
@@ -112,7 +113,7 @@ class Background:
         made_by: Versions, seeds, hashes, by what they are of.
     """
 
-    labels: Labels
+    names: Names
     dt: float
     loops: tuple[Loop, ...] = field(repr=False)
     parameters: tuple[ParameterLine, ...] = field(repr=False)
@@ -120,29 +121,41 @@ class Background:
     episodes: tuple[int, int, int, int]
     made_by: tuple[tuple[str, str], ...]
 
-    def named(self, labels: Labels | None) -> Background:
+    def named(self, names: Names | None) -> Background:
         """With other names.
 
         Raises:
             InvalidArgumentError: For fewer or more of them than there are columns.
         """
-        if labels is None:
+        if names is None:
             return self
         for what in ("states", "inputs"):
-            n, given = len(getattr(self.labels, what)), len(getattr(labels, what))
+            n, given = len(getattr(self.names, what)), len(getattr(names, what))
             if n != given:
-                raise InvalidArgumentError(f"labels.{what}", expected=f"{n} names", actual=f"{given}")
-        return replace(self, labels=labels)
+                raise InvalidArgumentError(f"names.{what}", expected=f"{n} names", actual=f"{given}")
+        return replace(self, names=names)
 
 
-def labels_of(dataset: Any, layout: Layout) -> Labels:
-    """The plant's own names where the data set says that it is of a task that is known here."""
+def names_of(dataset: Any, mpc: MPC) -> Names:
+    """Those that the model carries, else those of the task that a data set is of, where it is known here."""
+    layout, numbered = mpc.layout, Names.numbered(mpc.layout)
+    if layout.labels.states or layout.labels.inputs:
+        return Names(tuple(map(str, layout.y_labels)), tuple(map(str, layout.u_labels)))
     spec = getattr(getattr(dataset, "spec", None), "env_spec", None)
-    plant, numbered = None if spec is None else find_plant(str(spec.id)), Labels.numbered(layout)
-    if plant is None or (len(plant.observations), len(plant.inputs)) != (layout.ny, layout.nu):
+    plant = None if spec is None else find_plant(str(spec.id))
+    if spec is None or plant is None or (len(plant.observations), len(plant.inputs)) != (mpc.ny, mpc.nu):
         return numbered
-    inputs = tuple(each.label for each in plant.inputs)
-    return Labels(plant.observations, inputs, plant=str(spec.id))
+    inputs = tuple(_plain(each.label) for each in plant.inputs)
+    return Names(tuple(map(_plain, plant.observations)), inputs, plant=str(spec.id))
+
+
+def _plain(label: str) -> str:
+    """A label with formulas as text of any alphabet."""
+    label = re.sub(r"\\dot\s*(\\?\w+)", "\\1\N{COMBINING DOT ABOVE}", label)
+    label = re.sub(r"\\(cos|sin)", r"\1 ", label)
+    for name, letter in {"\\varphi": "φ", "\\tau": "τ", "$": "", "_": ""}.items():
+        label = label.replace(name, letter)
+    return label
 
 
 def parameter_lines(nominal: MPC, learned: MPC, found: Identification) -> tuple[ParameterLine, ...]:

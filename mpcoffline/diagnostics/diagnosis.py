@@ -30,8 +30,8 @@ from .background import (
     Background,
     column_lines,
     episode_line,
-    labels_of,
     made_by,
+    names_of,
     parameter_lines,
 )
 from .differences import TODAY, Difference
@@ -178,7 +178,7 @@ def diagnose(
         trust=trust,
         limits=limits,
         background=Background(
-            labels=labels_of(dataset, learned.layout),
+            names=names_of(dataset, learned),
             dt=learned.model.dt,
             loops=shown,
             parameters=parameter_lines(nominal, learned, found),

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from mpcoffline.core.text import listed, visible
 
-from .background import Labels, ParameterLine
+from .background import Names, ParameterLine
 from .differences import SURE, TODAY, Difference, candidates
 from .page_figures import loop_panels, panels
 from .verdict import costs_of
@@ -32,20 +32,20 @@ _GROUPS = {"model": "Model", "cost": "Stage cost", "terminal": "Terminal cost", 
 _SHORT = {"recommend": "good", "try with care": "care", "keep MPC_1": "keep"}
 
 
-def page_of(report: Report, *, title: str = "", labels: Labels | None = None) -> str:
+def page_of(report: Report, *, title: str = "", names: Names | None = None) -> str:
     """A report as a page of HTML.
 
     Args:
         report: The report.
         title: Its heading; the plant's name by default.
-        labels: Names and units, where they are known better.
+        names: Names and units, where they are known better.
 
     Raises:
-        InvalidArgumentError: For labels of another number of columns.
+        InvalidArgumentError: For names of another number of columns.
     """
-    background = None if report.background is None else report.background.named(labels)
-    unit = "" if background is None else background.labels.cost
-    plant = "" if background is None else background.labels.plant
+    background = None if report.background is None else report.background.named(names)
+    unit = "" if background is None else background.names.cost
+    plant = "" if background is None else background.names.plant
     pictures = panels(report)
     loops: list[dict[str, Any]] = []
     for k, loop in enumerate(background.loops if background is not None else ()):
@@ -209,17 +209,17 @@ def _parameter(line: ParameterLine) -> dict[str, str]:
 def _columns(report: Report) -> list[dict[str, Any]]:
     if report.background is None:
         return []
-    labels = report.background.labels
-    names = (*labels.states, *labels.inputs, "stage cost")
+    names = report.background.names
+    called = (*names.states, *names.inputs, "stage cost")
     return [
         {"name": name, "values": [number(v) for v in (c.low, c.mean, c.high, c.spread)]}
-        for name, c in zip(names, report.background.columns, strict=True)
+        for name, c in zip(called, report.background.columns, strict=True)
     ]
 
 
 def _noise(report: Report) -> list[dict[str, str]]:
     """Noise of each state."""
-    noise, names = report.noise, None if report.background is None else report.background.labels.states
+    noise, names = report.noise, None if report.background is None else report.background.names.states
     return [
         {
             "name": f"state {i + 1}" if names is None or i >= len(names) else names[i],

@@ -89,14 +89,14 @@ def loop_panels(loop: Loop, k: int, background: Background) -> Iterator[Picture]
         k: Its number, for the ids.
         background: Names and sampling time.
     """
-    labels = background.labels
-    rows = [(labels.states, loop.states, loop.states_on, False), (labels.inputs, loop.actions, loop.actions_on, True)]
-    for kind, (names, logged, on, held) in enumerate(rows):
+    names = background.names
+    rows = [(names.states, loop.states, loop.states_on, False), (names.inputs, loop.actions, loop.actions_on, True)]
+    for kind, (called, logged, on, held) in enumerate(rows):
         for i in _telling(logged, list(on.values())):
             curves = {name: values[..., i] for name, values in on.items()}
-            caption = f"{names[i]}: {_range_in_words(logged[:, i], curves)}"
+            caption = f"{called[i]}: {_range_in_words(logged[:, i], curves)}"
             yield _picture(
-                f"l{k}-{kind}-{i}", _Panel(names[i], logged[:, i], curves, background.dt, held), caption, _LOW
+                f"l{k}-{kind}-{i}", _Panel(called[i], logged[:, i], curves, background.dt, held), caption, _LOW
             )
 
 

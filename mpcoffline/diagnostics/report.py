@@ -18,7 +18,7 @@ from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.plotting import save_figure
 from mpcoffline.simulation.trials import Trials
 
-from .background import Background, Labels
+from .background import Background, Names
 from .differences import TODAY, candidates
 from .figure import Traces, draw
 from .limits import LimitCheck
@@ -263,7 +263,7 @@ class Report:
         """
         return save_figure(self.plot(), Path(path))
 
-    def html(self, path: str | PathLike[str], *, title: str = "", labels: Labels | None = None) -> Path:
+    def html(self, path: str | PathLike[str], *, title: str = "", names: Names | None = None) -> Path:
         """Writes the report as one page of HTML, for a browser and for paper, that loads nothing from elsewhere.
 
         It begins with the verdict and its reasons; then what would change (costs, closed loops from the same starts),
@@ -273,16 +273,16 @@ class Report:
         Args:
             path: The file; what was there is replaced, its folder made where it is missing.
             title: The heading; by default the name of the plant, where that is known.
-            labels: Names and units of states, inputs and cost, where they are known better than from the data set.
+            names: Names and units of states, inputs and cost, where they are known better than from the data set.
 
         Returns:
             The file.
 
         Raises:
-            InvalidArgumentError: For labels of another number of columns.
+            InvalidArgumentError: For names of another number of columns.
             StorageError: If it cannot be written.
         """
-        return write_file(path, page_of(self, title=title, labels=labels))
+        return write_file(path, page_of(self, title=title, names=names))
 
 
 def _as_data(value: Any) -> Any:

@@ -14,7 +14,7 @@ from invented_report import GOOD, background, report_of
 from invented_trials import trials
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.diagnostics import Labels
+from mpcoffline.diagnostics import Names
 from mpcoffline.diagnostics.limits import LimitCheck
 from mpcoffline.diagnostics.loops import _chosen
 from mpcoffline.diagnostics.page import number, page_of, pair, prose
@@ -108,12 +108,12 @@ def test_whatever_came_of_the_trials_there_is_a_page(tried: object, name: str) -
 
 def test_other_names_take_the_place_of_numbers(tmp_path: Path) -> None:
     report = replace(report_of(GOOD), background=background())
-    path = report.html(tmp_path / "new" / "report.html", labels=Labels(("a", "b"), ("c",), plant="Tank"))
+    path = report.html(tmp_path / "new" / "report.html", names=Names(("a", "b"), ("c",), plant="Tank"))
     text = path.read_text(encoding="utf-8")
     assert "<h1>Tank</h1>" in text
-    assert report.html(tmp_path / "again.html", labels=Labels(("a", "b"), ("c",), plant="Tank")).read_text() == text
-    with pytest.raises(InvalidArgumentError, match=r"labels.states: expected 2 names, got 1"):
-        report.html(path, labels=Labels(("a",), ("c",)))
+    assert report.html(tmp_path / "again.html", names=Names(("a", "b"), ("c",), plant="Tank")).read_text() == text
+    with pytest.raises(InvalidArgumentError, match=r"names.states: expected 2 names, got 1"):
+        report.html(path, names=Names(("a",), ("c",)))
 
 
 def test_numbers_are_written_for_readers() -> None:

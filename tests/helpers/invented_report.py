@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from invented_trials import trials
 
-from mpcoffline.diagnostics import Labels, Report
+from mpcoffline.diagnostics import Names, Report
 from mpcoffline.diagnostics.background import Background, ColumnLine, ParameterLine
 from mpcoffline.diagnostics.figure import Traces
 from mpcoffline.diagnostics.loops import Loop
@@ -79,7 +79,7 @@ def background(proposal: str = "full fit", odd: str = "") -> Background:
     )
     nan = float("nan")
     return Background(
-        labels=Labels(("level [cm]", odd or "flow [l/s]"), ("valve [%]",), "EUR"),
+        names=Names(("level [cm]", odd or "flow [l/s]"), ("valve [%]",), "EUR"),
         dt=0.5,
         loops=(loop,),
         parameters=(
