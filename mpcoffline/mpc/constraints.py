@@ -167,7 +167,8 @@ class Constraint(AnyConstraint):
         if not isinstance(data["terminal"], bool):
             raise FileFormatError("constraint", expected="terminal true or false", actual=repr(data["terminal"])[:80])
         size = sizes.parameters.size
-        previous = data.get("uses_previous") is True
+        if not isinstance(previous := data["uses_previous"], bool):
+            raise FileFormatError("constraint: uses_previous", expected="true or false", actual=repr(previous)[:200])
         along = (sizes.nx, *((sizes.nu,) * (1 + previous)), size)
         inputs = (sizes.nx, size) if data["terminal"] else along
         # Not by its own name: CasADi takes no blanks in it.

@@ -49,7 +49,9 @@ def refused(*arguments: str | Path) -> str:
     return lines[0]
 
 
-COMMANDS = ["run", "reproduce", "collect", "learn", "evaluate", "diagnose", "plot", "export", "clean", "doctor"]
+COMMANDS = [
+    "run", "reproduce", "collect", "new", "check", "learn", "evaluate", "diagnose", "plot", "export", "clean", "doctor",
+]  # fmt: skip
 DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
 
 

@@ -29,7 +29,8 @@ def run(x: list[float], u: list[float], n: int = 4) -> Episodes:
     states = np.zeros((n, len(x), 2))
     states[:, :, 0] = x
     nothing = np.zeros((1, n))
-    return Episodes(nothing, nothing, nothing > 0.0, states, np.tile(np.array(u)[None, :, None], (n, 1, 1)))
+    actions = np.tile(np.array(u)[None, :, None], (n, 1, 1))
+    return Episodes(nothing, nothing, nothing > 0.0, states, actions, states[None], actions[None])
 
 
 def log_of(x: list[float], u: list[float]) -> TransitionTable:
