@@ -74,7 +74,7 @@ class OfflineMPCLearner:
             the best, MPC_1 where none is better; that solves MPCs, learning does not. ``"full"``, or another name,
             takes that one and tries nothing. The paper's preset has no others than the whole fit.
         polish: Whether weights of the best candidate are moved, too, by what closed loops on models of the log cost
-            (:func:`~mpcoffline.simulation.polishing.polished`); needs ``pip install "mpcoffline[polish]"``.
+            (``mpcoffline.simulation.polishing``); needs ``pip install "mpcoffline[polish]"``.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in

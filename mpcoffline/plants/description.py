@@ -305,7 +305,7 @@ class Plant:
         """A Gymnasium environment that simulates this plant.
 
         Args:
-            **options: As :class:`~mpcoffline.plants.PlantEnv` takes them, and those of :func:`gymnasium.make`.
+            **options: As :class:`~mpcoffline.plants.PlantEnv` takes them, and those of ``gymnasium.make``.
         """
         from .environment import made
 

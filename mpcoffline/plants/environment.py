@@ -38,7 +38,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     bounds and rates), and at the start ``"parameters"``. Episodes are cut off after the plant's ``steps``.
 
     * Parameters are drawn uniformly within ``spread`` of theirs and their bounds, anew each episode.
-    * States begin uniformly in :attr:`State.starts <mpcoffline.plants.State>`, and stay within the range of the state.
+    * States begin uniformly in ``starts`` of each :class:`~mpcoffline.State`, and stay within the range of the state.
     * A signal with a range takes uniform values of it, each held for 50 steps on average; one without stays ``usual``.
       A clock begins anywhere. ``signals`` says otherwise.
     * Inputs act late where the description says so, and change no faster than it says.

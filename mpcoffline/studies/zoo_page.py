@@ -138,10 +138,10 @@ def _of_verdicts(rows: Sequence[Outcome]) -> list[str]:
     for name in sorted({name for o in rows for name in o.would_withhold.split(", ") if name}):
         said = [o for o in rows if name in o.would_withhold.split(", ") and recommended(o, full=False)]
         right_ones, wrong_ones = sum(o.better for o in said), sum(o.worse for o in said)
-        lines.append(
+        lines += [
             f"* The rule {name!r} would have withheld {len(said)} recommendations: of {right_ones} controllers that are"
             f" better, {wrong_ones} that are worse"
-        )
+        ] * bool(said)
     total = [o.fit_s + o.verdict_s for o in rows]
     return [*lines, f"* Time in s of one core: verdict {_range([o.verdict_s for o in rows])}; with fit {_range(total)}"]
 
