@@ -34,8 +34,8 @@ def choose(
     """Tries MPCs on the models of the log and names the best.
 
     In rounds, each with more starts: after each, those leave that cost clearly more than the best. Where the last one
-    leaves several that are not alike, all usual starts choose and the spare ones judge. The best has the
-    least mean cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by
+    leaves several that are not alike, all usual starts choose and the spare ones judge. The best has the least mean
+    cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by
     both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the
     next best is asked; where no model has a vote, ``"MPC_1"`` stays.
 
@@ -72,9 +72,10 @@ def choose(
             act(list(more), slice(0, end))
         left, begin = [FIRST, *_still_good(trials, left, end, preferred)], end
         if left == [FIRST]:
+            tell(usual, usual, "")
             return trials.judged_from(begin), FIRST
     total = usual
-    if len(around.rows) > usual and _contested(trials, left, begin):
+    if len(left) > 2 and len(around.rows) > usual:
         act(left, slice(begin, usual))
         left, begin, total = [FIRST, *_still_good(trials, left, usual, preferred)], usual, len(around.rows)
     act([FIRST], slice(begin, total))
@@ -84,6 +85,7 @@ def choose(
         if trials.judged_from(begin).improves(name):
             chosen = name
             break
+    tell(usual, usual, "")
     return trials.judged_from(begin), chosen
 
 
@@ -103,13 +105,6 @@ def quick_policy(mpc: MPC) -> MPCPolicy:
             _ = policy.solver
             return policy
     return MPCPolicy(mpc)
-
-
-def _contested(trials: Trials, names: list[str], end: int) -> bool:
-    """Whether those that are left, MPC_1 among them, differ by more than a trifle."""
-    means = [trials.differences(name)[trials.votes][:, :end].mean(axis=1) for name in names]
-    scores = np.median(means, axis=1)
-    return bool(np.ptp(scores) > _TRIFLE * np.abs(scores).max()) and len(names) > 2
 
 
 def _still_good(trials: Trials, names: list[str], end: int, preferred: str) -> list[str]:

@@ -124,7 +124,8 @@ class LogModels:
         names += [f"residual {i}" for i in range(1, len(networks) + 1)]
         maps = np.stack([*thetas, *[mpc.theta] * len(networks)])
         members = Members(mpc, maps, networks, (invariants.projected, stops.kept))
-        errors, baseline = _judged(mpc, members, rows, held_out & usable, unwrapped)
+        judging = held_out & usable
+        errors, baseline = _judged(mpc, members, rows, judging if judging.any() else held_out, unwrapped)
         noise = np.zeros(mpc.layout.n_states)
         known = getattr(found, "noise", None)
         if known is not None and not known.negligible:

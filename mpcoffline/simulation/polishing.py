@@ -142,9 +142,10 @@ def _judged(mpc: MPC, before: Episodes, after: Episodes, count: int) -> Polished
     k = int(np.argsort(gains.mean(axis=1), kind="stable")[(len(gains) - 1) // 2])
     gain, error = float(gains[k].mean()), float(gains[k].std(ddof=1) / enough)
     result = Polished(mpc, False, gain, error, count, "")
-    figures = f"{gain:.3g} +- {_SURE * error:.2g} less an episode on the models that judge"
+    more = "less" if gain > 0.0 else "more"
+    figures = f"{abs(gain):.3g} +- {_SURE * error:.2g} {more} an episode on the models that judge"
     if gain > _MOST * float(before.cost[k].std()):
         return replace(result, reason=f"not polished: other weights promise {figures}, too much to be true")
     if not all(clear):
-        return replace(result, reason=f"not polished: other weights cost {figures}, which is not clear")
+        return replace(result, reason=f"not polished: other weights cost {figures}, which is no clear gain")
     return replace(result, taken=True, reason=f"polished: its weights cost {figures}")

@@ -33,6 +33,7 @@ _ARRAYS = {
     "n_steps": "i",
 }
 _NOISE = 7
+_SURE = 2.0  # standard errors
 _RUN_AWAY = 30.0  # spreads of the data: a state this far out has left what any model of them knows
 
 
@@ -130,7 +131,7 @@ class Trials:
             middle = int(np.argsort(gains.mean(axis=1), kind="stable")[len(gains) // 2])
             fresh = gains[middle][self.judged]
             error = fresh.std() / np.sqrt(len(fresh)) if len(fresh) else 0.0
-            if not gains[middle].mean() <= 0.0 or (len(fresh) and fresh.mean() > 2.0 * error):
+            if not gains[middle].mean() <= 0.0 or (len(fresh) and fresh.mean() > _SURE * error):
                 return False
         return True
 

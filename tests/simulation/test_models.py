@@ -226,3 +226,5 @@ def test_what_the_plant_cut_off_is_no_error_of_a_model() -> None:
     rows = np.arange(0, n * steps, steps)
     np.testing.assert_allclose(seeing.replayed(log, rows, steps, believed), 0.0, atol=1e-5)
     assert np.abs(blind.replayed(log, rows, steps)[0]).max() > 0.3
+    nowhere = LogModels.of(mpc, log, None, n_residual=0, believed=lambda table: np.zeros(len(table), dtype=bool))
+    assert np.isfinite(nowhere.errors).all()
