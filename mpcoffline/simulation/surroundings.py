@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, smooth
 from mpcoffline.estimation.plant import state_rows
@@ -21,6 +22,8 @@ _MOST_STEPS = 400
 _MOST_MODELS, _CHOOSING_MODELS = 7, 4
 _FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
 _LEAST_STEPS = 20  # of an episode, or a horizon
+_AS_MUCH = 2.0  # times what a model misses elsewhere
+_NEXT_TO_NOTHING = 0.01  # spreads of the increments
 
 
 def surroundings_of(
@@ -66,6 +69,8 @@ def surroundings_of(
     models = models.asked(most_models, identified=not choosing)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
     spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
+    whole = _from_the_begin(identified, table, found) if len(clean) < len(table) else None
+    clean = clean if whole is None else whole
     rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)
     if n_steps is None:
         n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
@@ -74,6 +79,25 @@ def surroundings_of(
     return Surroundings(
         models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare, before, n_before
     )
+
+
+def _from_the_begin(mpc: MPC, table: TransitionTable, found: Identification) -> TransitionTable | None:
+    """The transitions with the first ones of episodes, as if the usual input had been applied before; smoothed.
+
+    None where these transitions do not look so: where the model misses them by more than twice what it misses others.
+    """
+    logged = with_memory(table, mpc.layout, mpc.usual_input)
+    values, n = logged.values(), mpc.layout.n_states
+    missed = (values.next_observations - mpc.model(values.observations, values.actions))[:, :n]
+    _, firsts, lengths = logged.episodes
+    first = np.arange(len(logged)) - np.repeat(np.sort(firsts), lengths[np.argsort(firsts)]) < mpc.layout.steps
+    if first.all():
+        return None
+    moved = (values.next_observations - values.observations)[:, :n].std(axis=0)
+    size, others = (np.sqrt(np.mean(missed[rows] ** 2, axis=0)) for rows in (first, ~first))
+    if not (size <= np.maximum(_AS_MUCH * others, _NEXT_TO_NOTHING * moved)).all():
+        return None
+    return logged if found.noise.negligible else smooth(mpc, logged, found.theta, found.noise)
 
 
 def _usual_length(table: TransitionTable) -> int:
