@@ -69,35 +69,36 @@ def surroundings_of(
     models = models.asked(most_models, identified=not choosing)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
     spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
-    whole = _from_the_begin(identified, table, found) if len(clean) < len(table) else None
-    clean = clean if whole is None else whole
+    if len(clean) < len(table):
+        whole = with_memory(table, mpc.layout, identified.usual_input)
+        if _begins_as_usual(identified, whole):
+            logged, clean = whole, whole
+            if not found.noise.negligible:
+                clean = smooth(identified, whole, found.theta, found.noise)
     rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)
     if n_steps is None:
         n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
     n_before = mpc.layout.steps if len(clean) < len(table) else 0
     before = costs_before(table, clean, rows, n_before)
-    return Surroundings(
-        models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare, before, n_before
-    )
+    steps = max(1, n_steps - n_before)
+    return Surroundings(models, cost, clean, rows, steps, mpc.layout, seed, spare, before, n_before, logged)
 
 
-def _from_the_begin(mpc: MPC, table: TransitionTable, found: Identification) -> TransitionTable | None:
-    """The transitions with the first ones of episodes, as if the usual input had been applied before; smoothed.
+def _begins_as_usual(mpc: MPC, table: TransitionTable) -> bool:
+    """Whether the first transitions of episodes look as if the usual input had been applied before, as the table says.
 
-    None where these transitions do not look so: where the model misses them by more than twice what it misses others.
+    That is: whether the model misses them by no more than twice what it misses others.
     """
-    logged = with_memory(table, mpc.layout, mpc.usual_input)
-    values, n = logged.values(), mpc.layout.n_states
+    values, n = table.values(), mpc.layout.n_states
     missed = (values.next_observations - mpc.model(values.observations, values.actions))[:, :n]
-    _, firsts, lengths = logged.episodes
-    first = np.arange(len(logged)) - np.repeat(np.sort(firsts), lengths[np.argsort(firsts)]) < mpc.layout.steps
+    _, firsts, lengths = table.episodes
+    order = np.argsort(firsts)
+    first = np.arange(len(table)) - np.repeat(firsts[order], lengths[order]) < mpc.layout.steps
     if first.all():
-        return None
+        return False
     moved = (values.next_observations - values.observations)[:, :n].std(axis=0)
     size, others = (np.sqrt(np.mean(missed[rows] ** 2, axis=0)) for rows in (first, ~first))
-    if not (size <= np.maximum(_AS_MUCH * others, _NEXT_TO_NOTHING * moved)).all():
-        return None
-    return logged if found.noise.negligible else smooth(mpc, logged, found.theta, found.noise)
+    return bool((size <= np.maximum(_AS_MUCH * others, _NEXT_TO_NOTHING * moved)).all())
 
 
 def _usual_length(table: TransitionTable) -> int:
