@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from heapq import heapify, heappop, heappush
 
 import casadi as ca
+import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc.expressions import Instruction, expanded, instructions
@@ -46,26 +47,39 @@ class Graph:
 
     def eliminate(self, k: int) -> None:
         """Replaces the paths through a result by edges: the chain rule at one place."""
-        for source in self.into[k]:
+        into, out_of = self.into[k], self.out_of[k]
+        self.into[k], self.out_of[k] = {}, {}
+        for source in into:
             del self.out_of[source][k]
-        for target in self.out_of[k]:
+        for target in out_of:
             del self.into[target][k]
-        for source, inner in self.into[k].items():
-            for target, outer in self.out_of[k].items():
+        for source, inner in into.items():
+            for target, outer in out_of.items():
                 self.connect(source, target, outer * inner)
 
     def paths_through(self, k: int) -> int:
         """How many paths lead through a result."""
         return len(self.into[k]) * len(self.out_of[k])
 
-    def eliminate_all(self, numbers: Iterable[int], *, growing: bool = True) -> None:
+    def copy(self) -> Graph:
+        """The same graph, to go on with in another way."""
+        other = Graph()
+        other.values = list(self.values)
+        other.into, other.out_of = ([dict(edges) for edges in each] for each in (self.into, self.out_of))
+        return other
+
+    def eliminate_all(self, numbers: Iterable[int], *, growing: bool = True, most: float = np.inf) -> int:
         """Eliminates results, the one with the fewest paths through it first.
 
         Args:
             numbers: Which; each is computed from others.
             growing: Whether also those through which there are more paths than edges.
+            most: Multiplications, after which it is given up.
+
+        Returns:
+            How many multiplications of derivatives that took.
         """
-        left = set(numbers)
+        left, taken = set(numbers), 0
         queue = [(self.paths_through(k), k) for k in left]
         heapify(queue)
         while left and queue:
@@ -77,8 +91,12 @@ class Graph:
                 continue
             neighbours = [n for n in (*self.into[k], *self.out_of[k]) if n in left]
             self.eliminate(k)
+            taken += paths
+            if taken > most:
+                break
             for neighbour in neighbours:
                 heappush(queue, (self.paths_through(neighbour), neighbour))
+        return taken
 
 
 def value_and_jacobian(expression: ca.SX, z: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
