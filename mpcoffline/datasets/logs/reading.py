@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _SLOW = 1.2  # control intervals, beyond which rows are too far apart
 _CLIPPED = 0.01  # of an input's range, by which it may lie beyond its bounds
 _MOST_BEYOND = 0.2  # share of rows
+_UNIT = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
 
 #: The cost of steps ``(n,)`` from states, inputs, present signals and the inputs of the step before, ``(n, ...)`` each.
 Cost = Callable[[Array, Array, Array, Array], Array]
@@ -157,8 +158,7 @@ def _mend(rows: Rows, wanted: Wanted, report: LogReport) -> None:
         if beyond.any():
             i = int(np.flatnonzero(beyond)[0])
             if beyond.mean() > _MOST_BEYOND:
-                hint = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
-                _refuse_beyond(rows, each, beyond, hint)
+                _refuse_beyond(rows, each, beyond, _UNIT)
             report.leave_out(
                 each.name, f"outside {each.low:g} to {each.high:g} {each.unit}".rstrip(), beyond.sum(), rows.place(i)
             )
@@ -177,6 +177,22 @@ def _mend(rows: Rows, wanted: Wanted, report: LogReport) -> None:
         for end in ends:
             if (share := float(np.mean(v == end))) > _CLIPPED:
                 report.note(f"{each.name} is at the end of its range, {end:g}, in {share:.0%} of the rows")
+    for each, period in zip(wanted.signals, wanted.periods, strict=True):
+        if period is None:
+            _plausible(rows, each, report)
+
+
+def _plausible(rows: Rows, each: Quantity, report: LogReport) -> None:
+    """A signal about its range: what comes from outside may leave it, but not lie farther off than it is wide."""
+    v, width = rows.values[each.name], each.high - each.low
+    if not np.isfinite(width):
+        return
+    if np.mean((v < each.low - width) | (v > each.high + width)) > _MOST_BEYOND:
+        _refuse_beyond(rows, each, (v < each.low) | (v > each.high), _UNIT)
+    share = float(np.mean((v < each.low) | (v > each.high)))
+    if share > _CLIPPED:
+        text = f"{each.name} is outside its range, {each.low:g} to {each.high:g} {each.unit}".rstrip()
+        report.note(f"{text}, in {share:.0%} of the rows")
 
 
 def _free_of_stuck(rows: Rows, each: Quantity, v: Array, others: list[Array], report: LogReport) -> None:
