@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mpcoffline.core.notebook import html_of
 from mpcoffline.core.tables import Table
 from mpcoffline.estimation import DelaySearch, Identification
 
@@ -72,6 +73,11 @@ class LogCheck:
             return f"Not yet worth tuning: {n} {'thing is' if n == 1 else 'things are'} to be looked at first."
         gain = [each.text for each in self.remarks if each.about == "gain"]
         return " ".join(gain) or "Nothing speaks against tuning."
+
+    def _repr_html_(self) -> str:
+        """The page, for notebooks."""
+        said = [f"{each.kind}: {each.about}: {each.text}" for each in self.remarks if each.about != "gain"]
+        return html_of(self.verdict, tables=self.tables, sentences=[*self.head.splitlines(), *said])
 
     def __str__(self) -> str:
         """The page."""

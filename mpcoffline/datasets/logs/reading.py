@@ -70,10 +70,16 @@ class LoggedTable(TransitionTable):
     Attributes:
         report: What became of the log.
         action_bounds: Bounds of the inputs, ``(nu,)`` each.
+        names: Names and units of its columns, observations first.
     """
 
     report: LogReport
     action_bounds: tuple[Array, Array]
+    names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Its log and columns."""
+        return f"LoggedTable({self.name!r}, n={len(self)}; {', '.join(self.names)})"
 
     def to_minari(self, dataset_id: str, *, overwrite: bool = False) -> MinariDataset:
         """Stores the log as a Minari data set.
@@ -97,7 +103,8 @@ class LoggedTable(TransitionTable):
             for p in parts
         ]
         low, high = self.action_bounds
-        text = f"Log {self.name}."
+        s, a = (", ".join(names) for names in (self.names[: self.ny], self.names[self.ny :]))
+        text = f"Log {self.name}. Observations: {s}. Actions: {a}."
         return dataset_from_arrays(
             dataset_id, episodes, action_low=low, action_high=high, description=text, overwrite=overwrite
         )
@@ -282,8 +289,24 @@ def _sampled(name: str, rows: Rows, wanted: Wanted, max_gap: float, report: LogR
     built = packed_blocks(name, blocks, ny, nu)
     table = LoggedTable(built.rows, ny, nu, built.episode_ids, name, centring=built.centring)
     table.report = report
+    table.names = _names(wanted)
     table.action_bounds = tuple(np.array([getattr(q, end) for q in wanted.inputs]) for end in ("low", "high"))  # type: ignore[assignment]
     return table
+
+
+def _names(wanted: Wanted) -> tuple[str, ...]:
+    """Of the columns of observations and actions, with units."""
+    names = [_labelled(each) for each in wanted.states]
+    for each, preview, period in zip(wanted.signals, wanted.previews, wanted.periods, strict=True):
+        if period is not None:
+            names += [f"{each.name}, cosine", f"{each.name}, sine"]
+        else:
+            names += [_labelled(each), *(f"{_labelled(each)}, {k} ahead" for k in range(1, preview + 1))]
+    return (*names, *(_labelled(each) for each in wanted.inputs))
+
+
+def _labelled(each: Quantity) -> str:
+    return f"{each.name} [{each.unit}]" if each.unit else each.name
 
 
 def _signals(series: dict[str, Series], wanted: Wanted, at: Array, max_gap: float, epoch: float) -> Array:
