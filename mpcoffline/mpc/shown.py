@@ -18,7 +18,9 @@ def html_of_mpc(mpc: MPC) -> str:
     """States, inputs, and parameters with their units."""
     low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
     inputs = [f"{u}, {a:g} to {b:g}" for u, a, b in zip(mpc.layout.u_labels, low, high, strict=True)]
-    limits = [each.name for each in mpc.constraints] if isinstance(mpc.constraints, Sequence) else []
+    limits = (
+        [str(getattr(each, "name", "")) for each in mpc.constraints] if isinstance(mpc.constraints, Sequence) else []
+    )
     facts = [
         ("observation", ", ".join(map(str, mpc.layout.y_labels))),
         ("inputs", "; ".join(inputs)),
