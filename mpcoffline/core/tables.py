@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import TYPE_CHECKING
 
 from .text import markdown, visible
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+
+_MOST_ROWS = 40  # that a notebook shows
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,22 @@ class Table:
     title: str = ""
     align: str = "l"
     styles: Sequence[str] = ()
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks; of long ones the first rows."""
+        caption = f"<caption>{escape(visible(self.title))}</caption>" if self.title else ""
+        head = f"<thead>{self._row(self.header, 'th')}</thead>" if self.header else ""
+        body = "".join(self._row(row, "td") for row in self.rows[:_MOST_ROWS])
+        if len(self.rows) > _MOST_ROWS:
+            body += f'<tr><td colspan="{len(self.rows[0])}">and {len(self.rows) - _MOST_ROWS} more</td></tr>'
+        return f"<table>{caption}{head}<tbody>{body}</tbody></table>"
+
+    def _row(self, cells: Sequence[str], kind: str) -> str:
+        sides = ("right" if self._is_right(k) else "left" for k in range(len(cells)))
+        inner = (
+            f'<{kind} style="text-align: {s}">{escape(visible(c))}</{kind}>' for s, c in zip(sides, cells, strict=True)
+        )
+        return f"<tr>{''.join(inner)}</tr>"
 
     def __rich__(self) -> RenderableType:
         from rich.table import Table as RichTable

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from html import escape
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mpcoffline.core.archive import plain
+from mpcoffline.core.notebook import html_of
 from mpcoffline.core.outputs import write_file
-from mpcoffline.core.text import figure, listed
+from mpcoffline.core.text import figure, listed, visible
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.plotting import save_figure
 from mpcoffline.simulation.trials import Trials
@@ -135,6 +137,12 @@ class Report:
     def reasons(self) -> tuple[str, ...]:
         """Why, and what to do; the decisive one first."""
         return self.judgement.reasons
+
+    def _repr_html_(self) -> str:
+        """The verdict and its reasons, for notebooks; the page of :meth:`html` has the rest."""
+        text = "\n".join(escape(visible(line)) for line in str(self).splitlines())
+        text = f"<details><summary>All figures</summary><pre>{text}</pre></details>"
+        return html_of(f"Verdict: {self.verdict}", sentences=self.reasons) + text
 
     def __str__(self) -> str:
         """The report as plain text."""

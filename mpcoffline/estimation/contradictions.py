@@ -13,12 +13,12 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
 from .findings import Excerpt, Finding, nominal_costs, predicted
-from .units import FACTORS, OFFSETS, in_words
+from .units import CONVERSIONS, FACTORS, in_words
 
 _FEW = 20  # rows below which nothing but the sizes is compared
 _LAGS = 20
 _SEEN = 4.5  # t of an effect that is there, of some hundreds that are looked at
-_A_FIFTH = 20.0  # t that the model's effect would have, where a fifth of it would be seen
+_A_THIRD = 14.0  # t that the model's effect would have, where a third of it would be seen
 _NO_TESTS = 1e-3  # share of an input's spread that does not follow from the state
 _SURE = 10.0  # standard errors
 _UNITS = 30.0  # times: more than any parameter is off
@@ -41,7 +41,7 @@ def alignment(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     hint = "Build s+ as observations[1:] and s as observations[:-1] of each episode."
     if same(x, reached).all():
         actual = f"the same row's observations in all of {len(x)} rows looked at"
-        yield Finding("next_observations", "the observations one step later", actual, hint, "error")
+        yield Finding("next_observations", "the observations one step later", actual, hint, "error", misread=True)
         return
     forward = same(reached[:-1], x[1:])[moves].mean()
     backward = same(reached[1:], x[:-1])[moves].mean()
@@ -50,7 +50,7 @@ def alignment(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     for share, words in ((backward, "one step earlier"), (skipping, "two steps later")):
         if share > 0.9 and forward < 0.1:
             actual = f"those of {words} in {share:.0%} of the rows looked at"
-            yield Finding("next_observations", "the observations one step later", actual, hint, "error")
+            yield Finding("next_observations", "the observations one step later", actual, hint, "error", misread=True)
 
 
 def episodes(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
@@ -140,14 +140,14 @@ def _apart(name: str, what: str, bottom: float, top: float, low: float, high: fl
 
     if meets(bottom, top, _FAR):
         return
-    others = [(in_words(factor, 0.0), bottom / factor, top / factor) for factor in FACTORS if top != 0.0]
-    others += [(in_words(1.0, offset), bottom - offset, top - offset) for offset in OFFSETS]
-    for words, a, b in others:
-        if meets(a, b, 0.1):
+    others = [(factor, 0.0) for factor in FACTORS if top != 0.0] + list(CONVERSIONS)
+    for factor, offset in others:
+        if meets((bottom - offset) / factor, (top - offset) / factor, 0.1):
+            words = in_words(factor, offset)
             at = f"{top:g}" if bottom == top else f"{bottom:g} to {top:g}"
             actual = f"data from {low:.4g} to {high:.4g}, which would meet it if they were {words}"
             hint = "Are data and MPC in the same unit?"
-            yield Finding(name, f"data near {what}, {at}", actual, hint)
+            yield Finding(name, f"data near {what}, {at}", actual, hint, misread=True)
             return
 
 
@@ -189,7 +189,7 @@ def gains(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
         if abs(ratio) > _UNITS:
             actual = f"one that does {ratio:.3g} times as much to observation {i}"
             hint = "Are data and model in the same unit?"
-            yield Finding(f"action {j}", "an input that does about what the model says", actual, hint)
+            yield Finding(f"action {j}", "an input that does about what the model says", actual, hint, misread=True)
 
 
 class _Effect(NamedTuple):
@@ -239,14 +239,14 @@ class _Effect(NamedTuple):
 
 
 def _nothing(mpc: MPC, log: Excerpt, j: int, name: str) -> Iterator[Finding]:
-    """A finding where an input has no effect, although a fifth of what the model says would be seen."""
+    """A finding where an input has no effect, although a third of what the model says would be seen."""
     effect = _Effect.of(mpc, log, j)
     if effect.share < _NO_TESTS:
         actual = f"one that follows from the state but for {effect.share:.0e} of its spread"
         hint = "Add test signals to it while recording: what it does cannot be told from what the state does."
         yield Finding(name, "an input with test signals", actual, hint)
         return
-    if effect.surely.max() < _A_FIFTH:
+    if effect.surely.max() < _A_THIRD:
         return
     own, motion = effect.own, effect.motion
     run = np.concatenate([[0], np.cumsum(~log.together)])
@@ -260,4 +260,5 @@ def _nothing(mpc: MPC, log: Excerpt, j: int, name: str) -> Iterator[Finding]:
             return
     seen = f"what the model says would be seen at {effect.surely.max():.0f} times its standard error"
     actual = f"no effect on any state in the next {_LAGS} steps ({seen})"
-    yield Finding(name, "an input that does something", actual, "Is it the column of what was applied to the plant?")
+    hint = "Is it the column of what was applied to the plant?"
+    yield Finding(name, "an input that does something", actual, hint, misread=True)

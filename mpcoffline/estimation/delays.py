@@ -7,6 +7,7 @@ from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
+import scipy.stats
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
@@ -28,7 +29,7 @@ _NEAR_BOUND = 1e-2  # in scaled coordinates
 _PRIOR = 1e-8  # of the scaled coordinates: keeps them where nothing else does
 _LEAST_GAIN = 0.05  # of the one-step error
 _PROMISING = 0.99  # of the one-step error, by linear regression
-_SIGMAS = 3.0
+_SIGMAS, _CHANCE = 3.0, 0.00135  # the same in standard errors and as a probability
 _WINDOW = 15  # steps of the check over many, and rows of what counts as one observation of a difference
 _FEWEST_WINDOWS = 8  # for a standard error
 _NO_WORSE = 1.01
@@ -212,9 +213,7 @@ class _Scan:
     def _better(self, delay: tuple[int, ...], than: tuple[int, ...]) -> bool:
         """Whether a dead time is to be believed rather than another one."""
         squares, others = self._compared(delay, than)
-        difference = others - squares
-        error = difference.std(ddof=1) / np.sqrt(len(difference))
-        if not (self.gain(delay, than) <= 1.0 - _LEAST_GAIN and difference.mean() > _SIGMAS * error):
+        if not (self.gain(delay, than) <= 1.0 - _LEAST_GAIN and _larger(others, squares)):
             return False
         return self._ahead(delay, than) <= _NO_WORSE * self._ahead(than, delay)
 
@@ -282,6 +281,19 @@ class _Scan:
             followed = np.abs(np.nan_to_num(past.T @ missed / size)).max(axis=1)
         clear = followed > max(0.5 * followed.max(), 4.0 / np.sqrt(len(rows)))
         return int(np.flatnonzero(clear).max(initial=0))
+
+
+def _larger(first: Array, second: Array) -> bool:
+    """Whether the first ``(w,)`` are larger than the second beyond chance: in the mean, or in nearly every pair.
+
+    An input that moves now and then tells in few windows, whose mean scatters: there the signed ranks count (Wilcoxon,
+    Biometrics Bulletin 1, 1945).
+    """
+    difference = first - second
+    error = difference.std(ddof=1) / np.sqrt(len(difference))
+    if difference.mean() > _SIGMAS * error:
+        return True
+    return bool(difference.any() and scipy.stats.wilcoxon(difference, alternative="greater").pvalue < _CHANCE)
 
 
 def _standard(columns: Array) -> Array:

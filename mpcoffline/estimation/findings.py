@@ -31,6 +31,8 @@ class Finding:
         actual: What was found, in numbers.
         hint: What to do.
         kind: ``"error"`` where it is certain, ``"warning"`` where it is likely.
+        misread: Whether the data are something else than the model takes them for; what would be identified of them
+            means nothing then.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Finding:
     actual: str
     hint: str
     kind: Literal["error", "warning"] = "warning"
+    misread: bool = False
 
     def __str__(self) -> str:
         return f"{self.name}: expected {self.expected}, got {self.actual}. {self.hint}".rstrip()

@@ -8,8 +8,8 @@ makes a bad prediction a good one is evidence; a model that is merely wrong is n
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from itertools import combinations
+import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.integrators import Scheme
+from mpcoffline.mpc.integrators import MOST_SUBSTEPS, Scheme
 from mpcoffline.mpc.scaling import increments_scale
 
 from .findings import Excerpt, Finding, nominal_costs
+from .guesses import LONGER, Guess, Reading, every_guess, sampled
 from .identification import OneStepProblem, Rows, without_jumps
-from .units import FACTORS, OFFSETS, in_words
 
 _ROWS = 240
 _FEW = 60
@@ -36,6 +36,7 @@ _GAIN = np.log(4.0)
 _WORSE = np.log(1.5)
 _FAR = 2.5  # scaled coordinates: parameters off by a factor 12
 _TRIED, _TRIED_HEAVY = 10, 4
+_OF_ONE_NAME = 2
 _PRIOR = 1e-3
 _ITERATIONS, _ITERATIONS_HEAVY = 8, 4
 _PATIENCE = 6
@@ -43,41 +44,13 @@ _HEAVY = 1_500  # instructions of the map, as of many substeps
 _MOST_PARAMETERS = 100
 _FAILED = 1e3
 _AS_MUCH = 0.3
-_LONGER = (2.0, 5.0, 10.0, 60.0, 100.0, 1e3, 3600.0)
 _LATE, _NO_LATER = 0.3, 0.1  # logarithms; right logs come to 0.1 and less
 _TINY = 1e-3
-
-
-class Reading(NamedTuple):
-    """Rows as they may have been meant.
-
-    Attributes:
-        x: States, ``(m, n)``.
-        u: Inputs, then the present signals, ``(m, nu + n_signals)``.
-        reached: States after them, ``(m, n)``.
-        cost: Logged costs, ``(m,)``.
-        u_next: Inputs of the rows after, beside the signals of the same; NaN where there is none.
-    """
-
-    x: Array
-    u: Array
-    reached: Array
-    cost: Array
-    u_next: Array
-
-
-_Columns = tuple[tuple[int, ...], tuple[int, ...]]  # of states and of inputs
-
-
-class Guess(NamedTuple):
-    """One way to read the log otherwise: what it is about, in words, and how."""
-
-    name: str
-    expected: str
-    words: str
-    hint: str
-    read: Callable[[Reading], Reading]
-    columns: int = 1  # how many it changes: of guesses that explain as much, the one of fewest
+_MOVING = 0.05  # share of rows
+_LEAST_MOVED = 0.2  # of two readings that explain as much, the one whose parameters stay
+_ALIKE = 0.4  # logarithm that two parameters or more must be off by, for one pace to be the cause
+_BY_CHANCE = 0.1  # that parameters off at random would share a pace
+_MOST_INSTRUCTIONS = 20_000
 
 
 class Judged(NamedTuple):
@@ -86,12 +59,17 @@ class Judged(NamedTuple):
     Attributes:
         errors: Mean absolute errors in units of the motion, ``(n + 1,)``; the last is the cost's.
         floor: What a regression leaves; errors below it are no worse than it, ``(n + 1,)``.
-        moved: How far the parameters had to go, in scaled coordinates.
+        z: Where the parameters had to go, in scaled coordinates, ``(p,)``.
     """
 
     errors: Array
     floor: Array
-    moved: float
+    z: Array
+
+    @property
+    def moved(self) -> float:
+        """How far the parameters had to go."""
+        return float(np.abs(self.z).max(initial=0.0))
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -101,30 +79,31 @@ class Judged(NamedTuple):
 
 def model(mpc: MPC, log: Excerpt) -> Iterator[Finding]:
     """Whether the log, read otherwise, is what the model predicts; signals are taken as they are."""
-    reading, n = _rows(log, mpc.nu), mpc.layout.n_states
+    reading, n = _rows(log), mpc.layout.n_states
     if len(reading.x) < max(_FEW, 5 * (n + mpc.nu)):
         return
     judge = _Judge(mpc, reading)
     plain = judge.identified(reading)
-    if plain.good[:n].all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
-        yield from _late(judge, reading, plain)
+    if (plain.errors[:n] <= _GOOD).all() and plain.moved < _FAR and plain.errors[-1] < _NO_COST:
+        yield from list(_paced(mpc, reading, plain)) or _late(judge, reading, plain)
         return
     plain = judge.identified(reading, _PATIENCE)  # it may not have come to its end
-    guesses = _promising(judge, reading, _guesses(mpc))
+    guesses = _promising(judge, reading, every_guess(mpc))
     found = [(guess, judge.identified(guess.read(reading))) for guess in guesses]
-    found += [(_sampled(mpc.model.dt, k), _Judge(each, reading).identified(reading)) for k, each in _faster(mpc)]
+    found += [(sampled(mpc.model.dt, k), _Judge(each, reading).identified(reading)) for k, each in _other_paces(mpc)]
     gains = [_gain(plain, judged) for _, judged in found]
     if gains and max(gains) > 0.0:
-        # Of those that explain as much the one that changes least, and of these the one whose errors are smallest.
+        # Of those that explain as much the one that changes least, and of these the one whose errors are smallest, or
+        # whose parameters stay.
         best = [each for each, gain in zip(found, gains, strict=True) if gain > max(gains) - _AS_MUCH]
         fewest = min(guess.columns for guess, _ in best)
         guess, judged = min(
             (each for each in best if each[0].columns == fewest),
-            key=lambda each: float(np.log(each[1].errors + _TINY).sum()),
+            key=lambda each: float(np.log(each[1].errors + _TINY).sum()) + _LEAST_MOVED * each[1].moved,
         )
         yield _finding(guess, plain, judged, mpc)
     else:
-        yield from _late(judge, reading, plain)
+        yield from list(_paced(mpc, reading, plain)) or _late(judge, reading, plain)
 
 
 def _late(judge: _Judge, reading: Reading, plain: Judged) -> Iterator[Finding]:
@@ -134,7 +113,8 @@ def _late(judge: _Judge, reading: Reading, plain: Judged) -> Iterator[Finding]:
     """
     if not np.isfinite(reading.u_next).all():
         return
-    found = judge.identified(reading._replace(u=reading.u_next))
+    later = np.hstack([reading.u_next[:, : judge.nu], reading.u[:, judge.nu :]])
+    found = judge.identified(reading._replace(u=later))
     ratio = np.log(plain.errors[:-1] + _TINY) - np.log(found.errors[:-1] + _TINY)
     if ratio.sum() > _LATE and ratio.min() > -_NO_LATER:
         i = int(np.argmax(ratio))
@@ -143,7 +123,35 @@ def _late(judge: _Judge, reading: Reading, plain: Judged) -> Iterator[Finding]:
             f" {found.errors[i]:.1%} of observation {i}'s motion unexplained instead of {plain.errors[i]:.1%}"
         )
         hint = "The action of a row is what was applied from its s on, until its s+."
-        yield Finding("actions", "actions of the same row", actual, hint)
+        yield Finding("actions", "actions of the same row", actual, hint, misread=True)
+
+
+def _paced(mpc: MPC, reading: Reading, plain: Judged) -> Iterator[Finding]:
+    """A finding where all rates are wrong by one factor: the parameters fit, but with another sampling time they stay.
+
+    Of p parameters off at random, a share ratio^(p - 1) would be as near to one pace.
+    """
+    off = int((np.abs(plain.z) > _ALIKE).sum())
+    if off < 2 or not (plain.errors[:-1] <= _GOOD).all():
+        return
+    size = float(np.sqrt(np.mean(plain.z**2)))
+    best, nearest = 1.0, size * _BY_CHANCE ** (1.0 / (len(plain.z) - 1))
+    for factor, other in _other_paces(mpc):
+        found = _Judge(other, reading).identified(reading)
+        left = float(np.sqrt(np.mean(found.z**2)))
+        if left < nearest and _no_worse(found, plain):
+            best, nearest = factor, left
+    if best != 1.0:
+        words = sampled(mpc.model.dt, best)
+        actual = (
+            f"data for which {off} parameters have to be off together, all rates by one factor, but by"
+            f" {np.expm1(nearest):.0%} if {words.words}"
+        )
+        yield Finding(words.name, words.expected, actual, words.hint, misread=True)
+
+
+def _no_worse(found: Judged, than: Judged) -> bool:
+    return bool((found.errors <= np.maximum(than.errors, than.floor) * np.exp(_NO_LATER)).all())
 
 
 def _gain(plain: Judged, found: Judged) -> float:
@@ -173,14 +181,13 @@ def _finding(guess: Guess, plain: Judged, found: Judged, mpc: MPC) -> Finding:
             f"data that the model explains with parameters a factor {np.exp(plain.moved):.0f} from the given ones, but"
             f" {np.exp(found.moved):.1f} if {guess.words}"
         )
-    return Finding(guess.name, guess.expected, actual, guess.hint)
+    return Finding(guess.name, guess.expected, actual, guess.hint, misread=True)
 
 
-def _rows(log: Excerpt, nu: int) -> Reading:
+def _rows(log: Excerpt) -> Reading:
     """Some of the rows, those with a row after them where there are enough."""
     u_next = np.full_like(log.u, np.nan)
     u_next[:-1][log.together] = log.u[1:][log.together]
-    u_next[:, nu:] = log.u[:, nu:]
     use = np.flatnonzero(~log.ended)
     followed = use[np.isfinite(u_next[use]).all(axis=1)]
     if len(followed) >= _FEW:
@@ -193,37 +200,40 @@ class _Judge:
     """How well a model predicts readings."""
 
     def __init__(self, mpc: MPC, reading: Reading) -> None:
-        self._mpc = mpc
+        self._mpc, self.nu = mpc, mpc.nu
         self._problem = OneStepProblem(mpc, Rows(reading.x, reading.u, reading.reached))
         self._adapts = 0 < self._problem.free.size <= _MOST_PARAMETERS
         heavy = mpc.plant_function.n_instructions() > _HEAVY
         self.tried, self._iterations = (_TRIED_HEAVY, _ITERATIONS_HEAVY) if heavy else (_TRIED, _ITERATIONS)
 
-    def nominal(self, readings: list[Reading]) -> list[Array]:
-        """Errors of many readings at theta_0, ``(n + 1,)`` each: one call of the model."""
+    def nominal(self, readings: list[Reading]) -> list[tuple[Array, Array]]:
+        """Errors of many readings at theta_0, ``(n + 1,)`` each, and of its motions times what fits best: one call."""
         x, u = (np.concatenate([getattr(r, name) for r in readings]) for name in ("x", "u"))
         parts = np.split(self._problem.model.predict(x, u, self._mpc.theta), len(readings))
-        return [
-            self._errors((part - r.reached) / (p := self._on(r)).scale, p, r)
-            for part, r in zip(parts, readings, strict=True)
-        ]
+        found = []
+        for part, r in zip(parts, readings, strict=True):
+            problem = self._on(r)
+            errors = (part - r.reached) / problem.scale
+            found.append((self._errors(errors, problem, r), self._errors(_fitted(part, r) / problem.scale, problem, r)))
+        return found
 
     def identified(self, reading: Reading, patience: int = 1) -> Judged:
         """Errors with the best parameters within their bounds, found in ``patience`` times the usual iterations."""
-        problem, moved = self._on(reading), 0.0
+        problem = self._on(reading)
+        z = np.zeros(problem.free.size)
         errors = problem.errors(self._mpc.theta)
         rows, _ = without_jumps(problem.rows, errors * problem.scale)  # wrapped angles
         problem.rows = rows
         errors = problem.errors(self._mpc.theta)
         if self._adapts:
             try:
-                z = problem.descend(np.zeros(problem.free.size), _PRIOR, patience * self._iterations).z
+                z = problem.descend(z, _PRIOR, patience * self._iterations).z
             except InvalidDataError:  # the reading is none that the model can take
                 pass
             else:
-                errors, moved = problem.errors(problem.theta(z)), float(np.abs(z).max())
+                errors = problem.errors(problem.theta(z))
         floor = np.append(np.maximum(_linear(problem.rows, reading.u), _FLOOR), _COST_FLOOR)
-        return Judged(self._errors(errors, problem, reading), floor, moved)
+        return Judged(self._errors(errors, problem, reading), floor, z)
 
     def _on(self, reading: Reading) -> OneStepProblem:
         problem = copy.copy(self._problem)
@@ -275,124 +285,59 @@ def _linear(rows: Rows, u: Array) -> Array:
 
 
 def _promising(judge: _Judge, reading: Reading, guesses: list[Guess]) -> list[Guess]:
-    """Those that do best at theta_0, in the order given."""
+    """Those that do best at theta_0, or would with other gains, in the order given."""
     some = Reading(*(part[::4] for part in reading))
     reads = [guess.read(some) for guess in guesses]
-    errors = judge.nominal(reads)
-    scores = [
-        float(np.log(np.maximum(error, _FLOOR)).mean()) if np.isfinite(read.reached).all() else np.inf
-        for error, read in zip(errors, reads, strict=True)
-    ]
-    chosen = np.sort(np.argsort(scores, kind="stable")[: judge.tried])
-    return [guesses[i] for i in chosen]
+    errors, moves = judge.nominal(reads), [_moves(read, some) for read in reads]
+    chosen: set[int] = set()
+    for which, most in ((0, judge.tried), (1, judge.tried // 2)):
+        scores = [
+            float(np.log(np.maximum(error[which], _FLOOR)).mean()) if good else np.inf
+            for error, good in zip(errors, moves, strict=True)
+        ]
+        chosen.update(_best(scores, [guess.name for guess in guesses], most))
+    return [guesses[i] for i in sorted(chosen)]
 
 
-def _guesses(mpc: MPC) -> list[Guess]:
-    """All of them, the simplest first."""
-    nx, nu = mpc.layout.n_states, mpc.nu
-    found = [*_signs(nx, nu), *_exchanges(nx, nu), *_sampling(mpc.model.dt)]
-    single: list[_Columns] = [((i,), ()) for i in range(nx)] + [((), (j,)) for j in range(nu)]
-    pairs: list[_Columns] = [(pair, ()) for pair in combinations(range(nx), 2)] if nx > 2 else []
-    mixed: list[_Columns] = [((i,), (j,)) for i in range(nx) for j in range(nu)]
-    whole: list[_Columns] = [(tuple(range(nx)), ())] if nx > 1 else []
-    whole += [((), tuple(range(nu)))] if nu > 1 else []
-    for xs, us in single + whole:
-        found += [_scaled(xs, us, factor, 0.0) for factor in FACTORS]
-    for xs, us in pairs:
-        found += [_scaled(xs, us, factor, 0.0) for factor in FACTORS[:6]]
-    for xs, us in single + whole + mixed + [(tuple(range(nx)), tuple(range(nu)))]:
-        found += [_scaled(xs, us, 1.0, offset) for offset in OFFSETS]
-    return sorted(found, key=lambda guess: guess.columns)
+def _best(scores: list[float], names: list[str], most: int) -> list[int]:
+    """Places of the lowest scores, two of a name at most: many factors of one column say the same."""
+    found: list[int] = []
+    for i in np.argsort(scores, kind="stable").tolist():
+        if np.isfinite(scores[i]) and sum(names[k] == names[i] for k in found) < _OF_ONE_NAME:
+            found.append(i)
+    return found[:most]
 
 
-def _scaled(xs: tuple[int, ...], us: tuple[int, ...], factor: float, offset: float) -> Guess:
-    def read(r: Reading) -> Reading:
-        x, u, reached = r.x.copy(), r.u.copy(), r.reached.copy()
-        x[:, xs], reached[:, xs] = factor * x[:, xs] + offset, factor * reached[:, xs] + offset
-        u[:, us] = factor * u[:, us] + offset
-        return r._replace(x=x, u=u, reached=reached)
-
-    names = [f"observation {i}" for i in xs] + [f"action {j}" for j in us]
-    name = " and ".join(names)
-    words = f"{name} {'is' if len(names) == 1 else 'are'} {in_words(factor, offset)}"
-    return Guess(name, "data in the model's units", words, "Are data and model in the same unit?", read, len(names))
+def _fitted(predicted: Array, r: Reading) -> Array:
+    """What a gain, not below zero, and an offset leave of the predicted motion, ``(m, n)``."""
+    motion, own = (part - r.x for part in (r.reached, predicted))
+    motion, own = motion - motion.mean(axis=0), own - own.mean(axis=0)
+    power = (own**2).sum(axis=0)
+    gain = np.maximum((own * motion).sum(axis=0) / np.where(power > 0.0, power, 1.0), 0.0)
+    return np.asarray(gain * own - motion)
 
 
-def _signs(nx: int, nu: int) -> Iterator[Guess]:
-    hint = "Which direction counts as positive?"
-    for j in range(nu):
-
-        def read_u(r: Reading, j: int = j) -> Reading:
-            u = r.u.copy()
-            u[:, j] *= -1.0
-            return r._replace(u=u)
-
-        yield Guess(f"action {j}", "the model's sign", f"the sign of action {j} is flipped", hint, read_u)
-    for i in range(nx):
-
-        def read_x(r: Reading, i: int = i) -> Reading:
-            x, reached = r.x.copy(), r.reached.copy()
-            x[:, i] *= -1.0
-            reached[:, i] *= -1.0
-            return r._replace(x=x, reached=reached)
-
-        yield Guess(f"observation {i}", "the model's sign", f"the sign of observation {i} is flipped", hint, read_x)
+def _moves(read: Reading, plain: Reading) -> bool:
+    """Whether a reading is complete, and moves what moves: a state that stands still is predicted by any model."""
+    if not np.isfinite(read.reached).all():
+        return False
+    moving = [(r.reached != r.x).mean(axis=0) > _MOVING for r in (read, plain)]
+    return bool((moving[0] | ~moving[1]).all())
 
 
-def _exchanges(nx: int, nu: int) -> Iterator[Guess]:
-    expected, hint = "columns in the model's order", "Compare the order of the columns with that of the model."
-    for a, b in combinations(range(nx), 2):
-
-        def read_states(r: Reading, a: int = a, b: int = b) -> Reading:
-            order = list(range(nx))
-            order[a], order[b] = b, a
-            return r._replace(x=r.x[:, order], reached=r.reached[:, order])
-
-        names = f"observations {a} and {b}"
-        yield Guess(names, expected, f"{names} are exchanged", hint, read_states)
-    for a, b in combinations(range(nu), 2):
-
-        def read_inputs(r: Reading, a: int = a, b: int = b) -> Reading:
-            order = list(range(nu))
-            order[a], order[b] = b, a
-            return r._replace(u=r.u[:, order])
-
-        names = f"actions {a} and {b}"
-        yield Guess(names, expected, f"{names} are exchanged", hint, read_inputs)
-    for i in range(nx):
-        for j in range(nu):
-
-            def read_both(r: Reading, i: int = i, j: int = j) -> Reading:
-                x, u, reached = r.x.copy(), r.u.copy(), r.reached.copy()
-                x[:, i], u[:, j], reached[:, i] = r.u[:, j], r.x[:, i], r.u_next[:, j]
-                return r._replace(x=x, u=u, reached=reached)
-
-            names = f"observation {i} and action {j}"
-            yield Guess(names, expected, f"{names} are exchanged", hint, read_both)
-
-
-def _sampling(dt: float) -> Iterator[Guess]:
-    for factor in _LONGER:
-        yield _sampled(dt, factor)
-        yield _sampled(dt, 1.0 / factor)
-
-
-def _sampled(dt: float, factor: float) -> Guess:
-    def read(r: Reading) -> Reading:
-        return r._replace(reached=r.x + (r.reached - r.x) / factor)
-
-    words = f"the log's sampling time is about {factor * dt:.3g} s ({factor:.3g} times as long)"
-    hint = "Give the model the log's dt, in the unit of time of its equations."
-    return Guess("dt", f"a log sampled every {dt:g} s, as the model says", words, hint, read)
-
-
-def _faster(mpc: MPC) -> Iterator[tuple[float, MPC]]:
-    """The MPC with its equations over shorter sampling times: a long step of theirs is no multiple of a short one."""
+def _other_paces(mpc: MPC) -> Iterator[tuple[float, MPC]]:
+    """The MPC with its equations over other sampling times: a long step of theirs is no multiple of a short one."""
     model = mpc.model
     if model.ode is None or model.scheme is None:
         return
-    for factor in _LONGER:
-        shorter = copy.copy(model)
-        shorter.dt = model.dt / factor
-        substeps = 2 if model.scheme == Scheme("rk4") else 1  # another scheme, so that the map is made anew
-        yield 1.0 / factor, mpc.replace(model=shorter.with_scheme(Scheme("rk4", substeps)))
+    heavy = mpc.plant_function.n_instructions()
+    for longer in LONGER:
+        for factor in (longer, 1.0 / longer):
+            other = copy.copy(model)
+            other.dt = model.dt * factor
+            substeps = max(2, math.ceil(2.0 * factor))
+            if heavy * substeps > _MOST_INSTRUCTIONS or substeps >= MOST_SUBSTEPS:
+                continue
+            if model.scheme == Scheme("rk4", substeps):
+                substeps += 1  # another scheme, so that the map is made anew
+            yield factor, mpc.replace(model=other.with_scheme(Scheme("rk4", substeps)))

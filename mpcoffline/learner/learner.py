@@ -15,12 +15,14 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
 from mpcoffline.core.checks import check_integers, check_known
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.notebook import html_of
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.shown import parameter_table
 
 from .candidates import FULL, TRIALS, Candidates, candidates_of
 from .checkpoint import Checkpoint, History, history_from_json
@@ -150,6 +152,12 @@ class OfflineMPCLearner:
             state += f", dead time {list(self._mpc.layout.delay)}"
         how = f"method={type(self.method).__name__}" if self.preset is None else f"preset={self.preset!r}"
         return f"{type(self).__name__}(learn={self.learn!r}, {how}, seed={self.seed}; {state})"
+
+    def _repr_html_(self) -> str:
+        table = parameter_table(self.nominal_mpc)
+        if isinstance(self._mpc, MPC):
+            table = parameter_table(self._mpc, self.nominal_mpc)
+        return html_of(repr(self), tables=[table], sentences=self.findings)
 
     def __str__(self) -> str:
         """The same, and what was found beside the parameters."""

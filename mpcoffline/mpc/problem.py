@@ -35,6 +35,7 @@ from .model import Model
 from .parameters import Group, ParameterSpace
 from .rest import at_rest, extreme_inputs
 from .seen import stage_expression, terminal_expression
+from .shown import html_of_mpc
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +107,9 @@ class MPC:
         if bounds.shape != (self.nu,) or np.isnan(bounds).any():
             raise InvalidArgumentError(name, expected=f"{self.nu} numbers, one an input", actual=str(bounds))
         return bounds
+
+    def _repr_html_(self) -> str:
+        return html_of_mpc(self)
 
     @property
     def nx(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from .log_check import LogCheck, Remark, check_log
+from .log_check import check_log
+from .page import LogCheck, Remark
 
 __all__ = ["LogCheck", "Remark", "check_log"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,106 +14,31 @@ from mpcoffline.core.tables import Table
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import DelaySearch, Identification, find_delays, identify
+from mpcoffline.estimation import find_delays, identify
 from mpcoffline.estimation.consistency import check
 from mpcoffline.estimation.multi_step import Windows, open_loop
 from mpcoffline.estimation.plant import plant_rows
 from mpcoffline.estimation.trajectories import Trajectories
+from mpcoffline.estimation.units import CONVERSIONS, in_words
 from mpcoffline.mpc import MPC
 from mpcoffline.plants import Plant
 
-from .experiment import Experiment, experiments
+from .determined import parameters, time_constants
+from .page import Kind, LogCheck
 
 _ROWS = 20_000
 _AHEAD = 10  # steps
-_DETERMINED, _WEAK = 0.1, 0.3  # relative deviation of a parameter
 _NOISY = 0.3  # of the increments' spread
 _STUCK = "stuck"
 _NEAR = 0.05  # of a state's spread about its goal
 _WORSE = 1.5  # times the identified model's error ahead, of the described one: tuning pays
-_POOR = 0.5  # of the spread, ten steps ahead
+_WELL, _POOR = 0.2, 0.5  # of the spread, ten steps ahead
+_AS_NOISE = 2.0  # times what noise makes of it
 _COARSE, _FINE = 1.0, 0.002  # control intervals in time constants
 _FEW = 200  # rows
-
-Kind = Literal["problem", "advice", "good"]
-
-
-@dataclass(frozen=True)
-class Remark:
-    """A sentence on log or description.
-
-    Attributes:
-        kind: ``"problem"``: mend it first; ``"advice"``: better with it; ``"good"``.
-        about: What it is about: a section of the page.
-        text: The sentence.
-    """
-
-    kind: Kind
-    about: str
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
-
-
-@dataclass
-class LogCheck:
-    """What a log and a description say of each other.
-
-    Attributes:
-        head: What was read.
-        remarks: What was found, problems first.
-        tables: Coverage, parameters and predictions.
-        identification: The model of the log; None where none could be found.
-        delays: What the log says of dead time.
-        experiments: What would determine the parameters that the log leaves open.
-    """
-
-    head: str = ""
-    remarks: list[Remark] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
-    identification: Identification | None = None
-    delays: DelaySearch | None = None
-    experiments: dict[str, Experiment | None] = field(default_factory=dict)
-
-    def add(self, kind: Kind, about: str, text: str) -> None:
-        """Enters a remark."""
-        self.remarks.append(Remark(kind, about, text))
-
-    @property
-    def problems(self) -> list[Remark]:
-        """What is to be mended first."""
-        return [each for each in self.remarks if each.kind == "problem"]
-
-    @property
-    def verdict(self) -> str:
-        """Whether tuning is worth it, in a sentence."""
-        if self.problems:
-            n = len(self.problems)
-            return f"Not yet worth tuning: {n} {'thing is' if n == 1 else 'things are'} to be looked at first."
-        gain = [each.text for each in self.remarks if each.about == "gain"]
-        return " ".join(["Worth tuning.", *gain])
-
-    def __str__(self) -> str:
-        """The page."""
-        lines = [self.verdict, "", self.head, ""]
-        for kind, title in (("problem", "To be mended first"), ("advice", "Advice"), ("good", "Good")):
-            chosen = [each for each in self.remarks if each.kind == kind and each.about != "gain"]
-            if chosen:
-                lines += [f"{title}:", *(f"* {each.about}: {each.text}" for each in chosen), ""]
-        for table in self.tables:
-            lines += [table.title, *(_plain(table)), ""]
-        return "\n".join(lines).rstrip()
-
-
-def _plain(table: Table) -> list[str]:
-    rows = [list(table.header), *map(list, table.rows)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(table.header))]
-    right = [(table.align[min(i, len(table.align) - 1)] == "r") for i in range(len(widths))]
-    return [
-        "  ".join(c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True)).rstrip()
-        for row in rows
-    ]
+_DEGREES = ("°", "deg", "K", "C", "F")  # in a unit that may be one of temperature
+_RESOLVED, _COARSE_STEP = 5_000, 0.1  # rows looked at, and of a state's spread
+_TREND, _SURE = 0.05, 5.0  # of the errors' variance, and standard errors
 
 
 def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogCheck:
@@ -138,7 +62,13 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
     for finding in findings.findings:
         found.add("problem", "description and data", str(finding))
     _coverage(plant, table, found)
-    if findings.errors:
+    _goal(plant, mpc, table, found)
+    misread = any(finding.misread for finding in findings.findings)
+    if misread:
+        text = "what rests on the model (dead time, parameters, noise, predictions) is looked at once that is mended"
+        found.add("advice", "description and data", text)
+    if misread or findings.errors:
+        found.sort()
         return found
     with _quiet():
         try:
@@ -147,12 +77,12 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
         except InvalidDataError as error:
             found.add("problem", "identification", str(error))
             return found
-    _parameters(plant, mpc, table, found)
+    parameters(plant, mpc, table, found)
     _noise(plant, found)
     _sampling(plant, mpc, table, found)
     _predictions(plant, mpc, table, found, seed)
-    _goal(plant, mpc, table, found)
-    found.remarks.sort(key=lambda each: ("problem", "advice", "good").index(each.kind))
+    _trend(plant, mpc, table, found)
+    found.sort()
     return found
 
 
@@ -185,6 +115,15 @@ def _coverage(plant: Plant, table: TransitionTable, found: LogCheck) -> None:
         rows.append((str(label), f"{a:.4g}", f"{b:.4g}", f"{s:.3g}", share))
     header = ("quantity", "least", "most", "spread", "of its range")
     found.tables.append(Table(header, rows, title="What the log covers", align="lr"))
+    every = table.sample(_RESOLVED, 0).values().observations
+    for i, q in enumerate(plant.states):
+        levels = np.unique(every[:, i])
+        step = float(np.median(np.diff(levels))) if len(levels) > 2 else 0.0
+        if step > _COARSE_STEP * float(every[:, i].std()) and len(levels) < 0.1 * len(every):
+            text = (
+                f"{q.name} comes in steps of {step:.3g} {q.unit}, {step / float(every[:, i].std()):.0%} of its spread"
+            )
+            found.add("advice", "resolution", f"{text}: what is smaller is lost; log more digits")
     actions = table.actions
     for j, each in enumerate(plant.inputs):
         ends = np.mean((actions[:, j] <= each.low) | (actions[:, j] >= each.high))
@@ -214,65 +153,6 @@ def _dead_time(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck, 
     return mpc.with_delay(delays.delay)
 
 
-def _parameters(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -> None:
-    """Which parameters the log determines, and what would determine the others."""
-    identified = found.identification
-    if identified is None or not plant.parameters:
-        return
-    n = mpc.model.space.size
-    values, deviations = identified.theta[:n], identified.deviation[:n]
-    rows, open_ones = [], []
-    left_open = " ".join(identified.undetermined)
-    for name, before, value, deviation in zip(
-        mpc.model.space.names, mpc.model.space.theta, values, deviations, strict=True
-    ):
-        relative = deviation / abs(value) if value else np.inf
-        in_doubt = f"model.{name}" in left_open.split() or deviation == 0.0
-        word = "no" if in_doubt or relative > _WEAK else "weakly" if relative > _DETERMINED else "yes"
-        if f"model.{name}" in identified.at_bound:
-            word = f"{word}, at its bound"
-        rows.append((name, plant.parameters[name].unit, f"{before:.4g}", f"{value:.4g}", f"{deviation:.2g}", word))
-        if not word.startswith("yes"):
-            open_ones.append(name)
-    header = ("parameter", "unit", "described", "in the log", "+-", "determined")
-    found.tables.append(Table(header, rows, title="Parameters", align="llrrrl"))
-    for name in identified.at_bound:
-        if not found.problems:
-            found.add("advice", "parameters", f"{name.removeprefix('model.')} ends at its bound: is the bound right?")
-    if not open_ones:
-        found.add("good", "parameters", f"the log determines all {n}")
-        return
-    model = mpc.with_theta(identified.theta)
-    rows_of = plant_rows(mpc, table).sample(5_000, 0).values()
-    signals = rows_of.actions[:, len(plant.inputs) :].mean(axis=0)
-    about = np.append(np.median(rows_of.observations, axis=0), signals)
-    least = 1e-3 * np.where(rows_of.observations.std(axis=0) > 0.0, rows_of.observations.std(axis=0), 1.0)
-    noise = np.maximum(identified.noise.measurement, least)
-    taus = _time_constants(model, rows_of.observations, rows_of.actions)
-    hold = int(np.clip(round(0.5 * float(np.median(taus)) / plant.dt), 1, 25)) if len(taus) else 2
-    found.experiments = experiments(model, open_ones, about, noise, hold)
-    weak = all(row[-1] == "weakly" for row in rows if row[0] in open_ones)
-    for name in open_ones:
-        explained = any(each.about == "description and data" for each in found.problems)
-        found.add(
-            "advice" if weak or explained else "problem", "excitation", _asked(plant, name, found.experiments[name])
-        )
-
-
-def _asked(plant: Plant, name: str, experiment: Experiment | None) -> str:
-    """What to record for a parameter."""
-    begin = f"the log does not determine {name}"
-    if experiment is None:
-        return f"{begin}, and no test of the inputs alone would: write its number into the equations, or vary the start"
-    each = plant.inputs[experiment.input]
-    minutes = experiment.steps * plant.dt / 60.0
-    length = f"{minutes:.0f} minutes" if minutes >= 2.0 else f"{60 * minutes:.0f} s"
-    return (
-        f"{begin}: move {each.name} at random between two values {2 * experiment.amplitude:.3g} {each.unit} apart, each"
-        f" kept for {experiment.hold * plant.dt:g} s or longer, for about {length}"
-    )
-
-
 def _noise(plant: Plant, found: LogCheck) -> None:
     """How noisy the measurements are."""
     identified = found.identification
@@ -289,31 +169,13 @@ def _noise(plant: Plant, found: LogCheck) -> None:
             found.add("advice", "noise", text)
 
 
-def _time_constants(mpc: MPC, x: Array, u: Array) -> Array:
-    """Time constants of the model about the middle of the log, in s."""
-    n = mpc.layout.n_states
-    plant = mpc.plant_function
-    middle, inputs = np.median(x, axis=0)[:n], np.median(u, axis=0)
-    size = 1e-4 * np.where(x[:, :n].std(axis=0) > 0.0, x[:, :n].std(axis=0), 1.0)
-    columns = [
-        (plant(middle + e, inputs, mpc.theta).full().ravel() - plant(middle - e, inputs, mpc.theta).full().ravel())
-        for e in np.diag(size)
-    ]
-    slopes = np.stack(columns, axis=1) / (2.0 * size)
-    if not np.isfinite(slopes).all():
-        return np.zeros(0)
-    sizes = np.abs(np.linalg.eigvals(slopes))
-    moving = (sizes > 1e-12) & (np.abs(np.log(np.maximum(sizes, 1e-300))) > 1e-6)
-    return np.asarray(mpc.model.dt / np.abs(np.log(sizes[moving])))
-
-
 def _sampling(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -> None:
     """The control interval against the time constants."""
     identified = found.identification
     if identified is None:
         return
     rows = plant_rows(mpc, table).sample(5_000, 0).values()
-    taus = np.sort(_time_constants(mpc.with_theta(identified.theta), rows.observations, rows.actions))
+    taus = np.sort(time_constants(mpc.with_theta(identified.theta), rows.observations, rows.actions))
     if not len(taus):
         return
     listed = ", ".join(f"{tau:.3g}" for tau in taus)
@@ -350,19 +212,65 @@ def _predictions(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck
     before, after = (float(np.sqrt(np.mean(np.minimum(e[_AHEAD], 1e3) ** 2))) for e in errors)
     check_ = identified.multi_step
     if check_ is not None and check_.suspicious and not any(r.about == "description and data" for r in found.problems):
-        found.add("problem", "structure", str(check_))
+        found.add("problem" if after > 0.5 * _WELL else "advice", "structure", str(check_))
     if after > _POOR:
         kind: Kind = "problem" if after > 0.9 else "advice"
         text = f"even with the best parameters, {_AHEAD} steps ahead the model misses by {after:.0%} of the spread"
         found.add(kind, "model", f"{text}: something moves the plant that the equations do not know")
+    noise = float(np.sqrt(2.0 * np.mean((identified.noise.measurement / scale) ** 2)))  # of start and end
+    found.add("good", "gain", _gain(before, after, noise))
+
+
+def _trend(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -> None:
+    """Whether what the identified model misses changes along the log, as of a sensor that drifts."""
+    identified = found.identification
+    if identified is None:
+        return
+    rows = plant_rows(mpc, table)
+    c = rows.take(np.arange(0, len(rows), max(1, len(rows) // _ROWS))).values()
+    missed = c.next_observations - mpc.plant_function(c.observations.T, c.actions.T, identified.theta).full().T
+    along = np.linspace(-1.0, 1.0, len(missed))
+    for i, q in enumerate(plant.states):
+        own = missed[:, i] - missed[:, i].mean()
+        size = float(own @ own)
+        if i in identified.unwrapped or not (np.isfinite(size) and size > 0.0 and len(own) > _AHEAD):
+            continue
+        r = float(own @ along) / np.sqrt(size * float(along @ along))
+        lasting = float(np.clip(own[1:] @ own[:-1] / size, 0.0, 0.99))
+        sure = abs(r) * np.sqrt(len(own) * (1.0 - lasting) / (1.0 + lasting))
+        if r**2 > _TREND and sure > _SURE:
+            text = (
+                f"what the model misses of {q.name} goes one way along the log ({r**2:.0%} of it): a sensor that"
+                " drifts, or a plant that changes"
+            )
+            found.add("advice", "drift", text)
+
+
+def _gain(before: float, after: float, noise: float) -> str:
+    """What better parameters would do for predictions, in the words of the verdict.
+
+    Args:
+        before: Error of the described model ten steps ahead, in spreads of the states.
+        after: The same of the identified one.
+        noise: What the sensors' noise makes of it.
+    """
     ratio = before / max(after, 1e-9)
     if ratio > _WORSE:
         times = f"{ratio:.1f}" if ratio < 100 else "more than 100"
-        found.add("good", "gain", f"The described model is {times} times as far off, ten steps ahead, as the log's.")
-    else:
-        found.add(
-            "good", "gain", "The description's parameters fit the log; what is to be gained is in cost and horizon."
+        return (
+            f"Worth tuning. Ten steps ahead, the described model is {times} times as far off as one with the"
+            " parameters of the log."
         )
+    missed = f"ten steps ahead they miss by {before:.0%} of the spread"
+    if after <= max(_WELL, _AS_NOISE * noise):
+        return (
+            f"Nothing speaks against tuning. The described parameters predict the log about as well as its best ones:"
+            f" {missed}. What the log cannot say before a fit is what cost and horizon gain."
+        )
+    return (
+        f"Tuning may gain little. Neither the described parameters nor the best ones predict the log well: {missed}"
+        f" and {after:.0%}, of which the sensors' noise makes {noise:.0%}. What is missing is in the equations."
+    )
 
 
 def _goal(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -> None:
@@ -384,6 +292,17 @@ def _goal(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -> No
             text = (
                 f"{q.name} is never nearer to its goal than {away.min():.3g} {q.unit}: what it costs there is a guess"
             )
+            if any(sign in q.unit for sign in _DEGREES):
+                text += _in_another_unit(np.asarray(observations[:, i], np.float64), goal)
             found.add("advice", "goal", text)
         else:
             found.add("good", "goal", f"{q.name} is within {near:.2g} {q.unit} of its goal in {share:.0%} of the rows")
+
+
+def _in_another_unit(logged: Array, goal: Array | float) -> str:
+    """Words on temperatures that would meet the goal in another unit."""
+    for factor, offset in CONVERSIONS:
+        meant = factor * logged + offset
+        if meant.min() <= np.max(goal) and np.min(goal) <= meant.max():
+            return f", or is it to be {in_words(factor, offset)}?"
+    return ""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_logs import Case, changed, found_in, heater, is_named, logged
+from planted_logs import Case, changed, defects, found_in, heater, is_named, logged
 from typer.testing import CliRunner
 
 from mpcoffline import Input, Plant, State
@@ -16,6 +16,7 @@ from mpcoffline.cli.own_plants import _show
 from mpcoffline.core.tables import Table
 from mpcoffline.tune import LogCheck, check_log
 from mpcoffline.tune.experiment import experiments
+from mpcoffline.tune.log_check import _gain
 
 pytest.importorskip("polars")
 
@@ -30,7 +31,15 @@ def stuck() -> dict[str, object]:
     return changed(LOG, T=T)
 
 
-@pytest.mark.parametrize("case", [KELVIN, STILL, Case("stuck", "heater", stuck, ("stuck at",))], ids=lambda c: c.name)
+CASES = {case.name: case for case in defects()}
+QUICK = ("dead time of 1 step", "another sampling time", "state and input exchanged", "a sensor that drifts")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [KELVIN, STILL, Case("stuck", "heater", stuck, ("stuck at",)), *(CASES[name] for name in QUICK)],
+    ids=lambda c: c.name,
+)
 def test_a_planted_defect_is_named(case: Case) -> None:
     problems, advice = found_in(case)
     assert is_named(case, problems, advice), (problems, advice)
@@ -54,6 +63,16 @@ def test_a_sound_log_is_worth_tuning_and_the_page_says_what_it_determines() -> N
     (parameters,) = [table for table in page.tables if table.title == "Parameters"]
     assert [row[-1] for row in parameters.rows] == ["yes", "yes"]
     assert page.identification.noise.measurement[0] == pytest.approx(0.05, rel=0.3)
+
+
+def test_the_verdict_claims_no_more_than_is_known() -> None:
+    begin = "Worth tuning. Ten steps ahead, the described model is 3.0 times"
+    assert _gain(0.9, 0.3, 0.01).startswith(begin)
+    assert _gain(0.05, 0.05, 0.0).startswith("Nothing speaks against tuning. The described parameters predict")
+    assert _gain(0.4, 0.38, 0.25).startswith("Nothing speaks against")  # noise makes most of it
+    poor = _gain(0.62, 0.55, 0.01)
+    assert poor.startswith("Tuning may gain little.")
+    assert "miss by 62% of the spread and 55%, of which the sensors' noise makes 1%" in poor
 
 
 def test_the_experiment_is_as_long_as_its_noise_asks_for() -> None:

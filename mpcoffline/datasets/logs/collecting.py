@@ -19,6 +19,7 @@ from .times import NAMES, Clock, in_zone, without_set_back
 from .units import readings
 
 _MOST_LOST = 0.2  # share of rows that may have no time stamp
+_EXCEL, _NO_SECONDS = (25_569.0, 73_050.0), 1e-3  # days of 1970 and 2100, and of a control interval
 _APART = 1_000.0  # control intervals between what restarts
 
 
@@ -90,6 +91,7 @@ class _Parts:
     rows: int = 0
     absolute: bool = True
     zoned: bool = False
+    unitless: bool = True
 
 
 def collected(
@@ -112,6 +114,7 @@ def collected(
         with opened(each) as source:
             _collect(source, quantities, dt, options, report, parts)
     report.rows = parts.rows
+    _days(parts, dt, report)
     t, kept = np.concatenate(parts.times), np.concatenate(parts.kept)
     parts.times.clear()
     begins = _begins(parts, t)
@@ -140,7 +143,10 @@ def collected(
         t, kept = t[order], kept[order]
         values = {name: v[order] for name, v in values.items()}
     if len(t) < 2:
-        raise InvalidDataError(parts.files[0][1].name, expected="two rows", actual=str(len(t)))
+        if parts.rows < 2:
+            raise InvalidDataError(parts.files[0][1].name, expected="two rows", actual=str(parts.rows))
+        actual = f"{parts.rows} rows of one time"
+        raise InvalidDataError(f"{parts.files[0][1].name}: time", expected="rows at two times", actual=actual)
     t -= (begin := float(t[0]))
     return Rows(t, epoch + begin, values, ~kept, order, parts.files)
 
@@ -150,7 +156,7 @@ def _collect(
 ) -> None:
     """The rows of one log."""
     columns = {name: Column(each) for name, each in found(source, quantities, options.columns, options.units).items()}
-    stamps, clock = _clock(source, options)
+    stamps, clock = _clock(source, options, {each.found.place for each in columns.values()})
     places = [(place_of(source, name, name)[0], values) for name, values in options.where.items()]
     episode = None if options.episode is None else place_of(source, options.episode, options.episode)[0]
     parts.files.append((parts.rows, source))
@@ -186,18 +192,33 @@ def _collect(
         report.note(clock.said)
     parts.rows += rows
     parts.absolute &= clock is not None and clock.absolute
+    parts.unitless &= clock is not None and clock.unitless
     parts.zoned |= clock is not None and clock.zoned
 
 
-def _clock(source: Source, options: Options) -> tuple[list[int], Clock | None]:
-    """The columns of the time, and what reads them; none where there is no such column."""
+def _days(parts: _Parts, dt: float, report: LogReport) -> None:
+    """Plain numbers that are no seconds, but Excel's days since 1899: as days they fit the control interval."""
+    if parts.absolute or not parts.unitless:
+        return
+    t = np.concatenate(parts.times)
+    t = t[np.isfinite(t)]
+    steps = np.diff(t)
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    if len(t) and _EXCEL[0] < t.min() and t.max() < _EXCEL[1] and 0.0 < usual < _NO_SECONDS * dt:
+        parts.times[:] = [86_400.0 * (each - _EXCEL[0]) for each in parts.times]
+        parts.absolute = True
+        report.note("time in days since 1899, as Excel writes it")
+
+
+def _clock(source: Source, options: Options, quantities: set[int]) -> tuple[list[int], Clock | None]:
+    """The columns of the time, and what reads them; none where there is no such column but a quantity's."""
     if options.time is not None:
         names = [options.time] if isinstance(options.time, str) else list(options.time)
         found_ones = [place_of(source, name, name) for name in names]
     else:
         taken: dict[str, int] = {}
         for i, header in enumerate(source.header):
-            for reading in readings(header):
+            for reading in readings(header) if i not in quantities else ():
                 taken.setdefault(reading.name.casefold().strip(), i)
         first = next((name for name in NAMES if name in taken), None)
         if first is None:

@@ -23,6 +23,7 @@ _MISSING = (
     "shutdown",
 )  # fmt: skip
 _SWITCHES = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0, "ein": 1.0, "aus": 0.0}
+_SHOWN = 40  # characters of a header in a message
 _MOST_TEXT = 0.2  # share of a column's cells that may be text
 
 
@@ -90,13 +91,15 @@ def place_of(source: Source, name: str, given: str | None) -> tuple[int, str | N
         unit = ranks[chosen[0]][1]
         return chosen[0], unit or (source.units[chosen[0]] if source.units and chosen[0] < len(source.units) else None)
     where = f"{source.name}: column of {name!r}" if given is None else f"{source.name}: column {given!r}"
-    listed = ", ".join(map(repr, source.header[:30]))
+    listed = ", ".join(f"{each[:_SHOWN]!r}" for each in source.header[:30])
+    if len(source.header) > 30:
+        listed += f" and {len(source.header) - 30} more"
     if chosen:
         actual = ", ".join(repr(source.header[i]) for i in chosen)
         hint = f"columns={{{name!r}: ...}} says which."
         raise InvalidDataError(where, expected="one column of that name", actual=f"{len(chosen)}: {actual}", hint=hint)
     near = difflib.get_close_matches(wanted, source.header, n=1, cutoff=0.4)
-    hint = f"Is it {near[0]!r}? " if near else ""
+    hint = f"Is it {near[0][:_SHOWN]!r}? " if near else ""
     raise InvalidDataError(
         where, expected=f"one among {listed}", actual="none", hint=f"{hint}columns={{{name!r}: ...}} says which."
     )

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _SLOW = 1.2  # control intervals, beyond which rows are too far apart
 _CLIPPED = 0.01  # of an input's range, by which it may lie beyond its bounds
 _MOST_BEYOND = 0.2  # share of rows
+_UNIT = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
 
 #: The cost of steps ``(n,)`` from states, inputs, present signals and the inputs of the step before, ``(n, ...)`` each.
 Cost = Callable[[Array, Array, Array, Array], Array]
@@ -69,10 +70,16 @@ class LoggedTable(TransitionTable):
     Attributes:
         report: What became of the log.
         action_bounds: Bounds of the inputs, ``(nu,)`` each.
+        names: Names and units of its columns, observations first.
     """
 
     report: LogReport
     action_bounds: tuple[Array, Array]
+    names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Its log and columns."""
+        return f"LoggedTable({self.name!r}, n={len(self)}; {', '.join(self.names)})"
 
     def to_minari(self, dataset_id: str, *, overwrite: bool = False) -> MinariDataset:
         """Stores the log as a Minari data set.
@@ -96,7 +103,8 @@ class LoggedTable(TransitionTable):
             for p in parts
         ]
         low, high = self.action_bounds
-        text = f"Log {self.name}."
+        s, a = (", ".join(names) for names in (self.names[: self.ny], self.names[self.ny :]))
+        text = f"Log {self.name}. Observations: {s}. Actions: {a}."
         return dataset_from_arrays(
             dataset_id, episodes, action_low=low, action_high=high, description=text, overwrite=overwrite
         )
@@ -157,8 +165,7 @@ def _mend(rows: Rows, wanted: Wanted, report: LogReport) -> None:
         if beyond.any():
             i = int(np.flatnonzero(beyond)[0])
             if beyond.mean() > _MOST_BEYOND:
-                hint = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
-                _refuse_beyond(rows, each, beyond, hint)
+                _refuse_beyond(rows, each, beyond, _UNIT)
             report.leave_out(
                 each.name, f"outside {each.low:g} to {each.high:g} {each.unit}".rstrip(), beyond.sum(), rows.place(i)
             )
@@ -177,6 +184,22 @@ def _mend(rows: Rows, wanted: Wanted, report: LogReport) -> None:
         for end in ends:
             if (share := float(np.mean(v == end))) > _CLIPPED:
                 report.note(f"{each.name} is at the end of its range, {end:g}, in {share:.0%} of the rows")
+    for each, period in zip(wanted.signals, wanted.periods, strict=True):
+        if period is None:
+            _plausible(rows, each, report)
+
+
+def _plausible(rows: Rows, each: Quantity, report: LogReport) -> None:
+    """A signal about its range: what comes from outside may leave it, but not lie farther off than it is wide."""
+    v, width = rows.values[each.name], each.high - each.low
+    if not np.isfinite(width):
+        return
+    if np.mean((v < each.low - width) | (v > each.high + width)) > _MOST_BEYOND:
+        _refuse_beyond(rows, each, (v < each.low) | (v > each.high), _UNIT)
+    share = float(np.mean((v < each.low) | (v > each.high)))
+    if share > _CLIPPED:
+        text = f"{each.name} is outside its range, {each.low:g} to {each.high:g} {each.unit}".rstrip()
+        report.note(f"{text}, in {share:.0%} of the rows")
 
 
 def _free_of_stuck(rows: Rows, each: Quantity, v: Array, others: list[Array], report: LogReport) -> None:
@@ -266,8 +289,24 @@ def _sampled(name: str, rows: Rows, wanted: Wanted, max_gap: float, report: LogR
     built = packed_blocks(name, blocks, ny, nu)
     table = LoggedTable(built.rows, ny, nu, built.episode_ids, name, centring=built.centring)
     table.report = report
+    table.names = _names(wanted)
     table.action_bounds = tuple(np.array([getattr(q, end) for q in wanted.inputs]) for end in ("low", "high"))  # type: ignore[assignment]
     return table
+
+
+def _names(wanted: Wanted) -> tuple[str, ...]:
+    """Of the columns of observations and actions, with units."""
+    names = [_labelled(each) for each in wanted.states]
+    for each, preview, period in zip(wanted.signals, wanted.previews, wanted.periods, strict=True):
+        if period is not None:
+            names += [f"{each.name}, cosine", f"{each.name}, sine"]
+        else:
+            names += [_labelled(each), *(f"{_labelled(each)}, {k} ahead" for k in range(1, preview + 1))]
+    return (*names, *(_labelled(each) for each in wanted.inputs))
+
+
+def _labelled(each: Quantity) -> str:
+    return f"{each.name} [{each.unit}]" if each.unit else each.name
 
 
 def _signals(series: dict[str, Series], wanted: Wanted, at: Array, max_gap: float, epoch: float) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mpcoffline.core.notebook import html_of
 from mpcoffline.core.tables import Table
 
 
@@ -58,6 +59,11 @@ class LogReport:
         """What was left out, as a table."""
         rows = [(each.what, each.why, f"{each.count:,}", each.first) for each in self.left_out]
         return Table(("column", "left out because", "rows", "first"), rows, align="llrl")
+
+    def _repr_html_(self) -> str:
+        """What was read, and what was left out, for notebooks."""
+        head = str(self).splitlines()[0]
+        return html_of(head, tables=[self.table] if self.left_out else [], sentences=self.notes)
 
     def __str__(self) -> str:
         head = (

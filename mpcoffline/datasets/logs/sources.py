@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +24,20 @@ if TYPE_CHECKING:
 BATCH = 250_000  # rows
 _HEAD = 64 * 1024  # bytes that are looked at
 _LINES = 50
+_FEWEST_LINES, _LONGEST_HEAD = 5, 1 << 24  # that are looked at, of tables with thousands of columns
 _SEPARATORS = ",;\t|"
 _BINARY = {
+    b"\xfd7zXZ": ("an xz archive", "Unpack it first."),
+    b"BZh": ("a bzip2 archive", "Unpack it first."),
+    b"\x28\xb5\x2f\xfd": ("a zstd archive", "Unpack it first."),
+    b"7z\xbc\xaf": ("a 7z archive", "Unpack it first."),
+    b"%PDF": ("a PDF", "Export the table as CSV or Parquet."),
+    b"{": ("JSON", "Export the table as CSV or Parquet."),
+    b"[{": ("JSON", "Export the table as CSV or Parquet."),
+    b"[[": ("JSON", "Export the table as CSV or Parquet."),
+    b"MATLAB": ("a MATLAB file", "Export the table as CSV or Parquet."),
+    b"\x93NUMPY": ("a NumPy array", "Export the table as CSV or Parquet, with names."),
+    b"FEA1": ("an old Feather file", "Save it as Parquet or Arrow."),
     b"PK\x03\x04": ("an archive, as of Excel", "Save it as CSV or Parquet."),
     b"\x1f\x8b": ("a gzip archive", "Unpack it first."),
     b"SQLite": ("a database", "Export the table as CSV or Parquet."),
@@ -104,6 +116,9 @@ def opened(source: Any) -> Iterator[Source]:
         if head.startswith(b"ARROW1"):
             yield _of_lazy(name, pl.scan_ipc(path))
             return
+        if head.startswith(b"\xff\xff\xff\xff"):
+            yield _of_lazy(name, pl.read_ipc_stream(path).lazy())
+            return
     except pl.exceptions.PolarsError as error:
         raise InvalidDataError(name, expected="a table", actual=str(error).splitlines()[0][:200]) from error
     for magic, (what, hint) in _BINARY.items():
@@ -140,7 +155,7 @@ def _of_lazy(name: str, frame: Any) -> Source:
 def _in_utf8(path: Path, head: bytes) -> Iterator[tuple[Path, str]]:
     """The file in UTF-8, itself where it is, and the encoding that it had."""
     encoding = _encoding(path, head)
-    if encoding == "utf-8":
+    if encoding == "utf-8" and (b"\n" in head or b"\r" not in head):  # line ends of old Macs are none to polars
         yield path, encoding
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -155,6 +170,8 @@ def _in_utf8(path: Path, head: bytes) -> Iterator[tuple[Path, str]]:
 
 def _encoding(path: Path, head: bytes) -> str:
     """By its mark, its zero bytes, or whether it is valid UTF-8 throughout."""
+    if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
+        return "utf-32"
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     even, odd = head[0:2000:2].count(0), head[1:2000:2].count(0)
@@ -180,19 +197,33 @@ def _of_text(pl: Any, name: str, path: Path, encoding: str) -> Source:
     """A text table; where it begins and how it is written is told by its first lines."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         text = file.read(_HEAD)
+        while text.count("\n") < _FEWEST_LINES and len(text) < _LONGEST_HEAD and (more := file.read(len(text))):
+            text += more
     lines = text.splitlines()[: _LINES + 30]
-    separator, skipped = _layout(name, lines)
-    rows = list(csv.reader(lines[skipped:], delimiter=separator))[:_LINES]
+    try:
+        separator, skipped = _layout(name, lines)
+        rows = list(csv.reader(lines[skipped:], delimiter=separator))[:_LINES]
+    except csv.Error as error:
+        raise InvalidDataError(name, expected="a table of numbers", actual=f"no row of one ({error})") from error
     header = [cell.strip() for cell in rows[0]]
     if len(rows) < 2:
         raise InvalidDataError(name, expected="rows below the header", actual="none")
     if any(re.fullmatch(_NUMBER, cell) for cell in header):
         hint = "Write the columns' names into the first line."
+        above = next(csv.reader(lines[skipped - 1 : skipped], delimiter=separator)) if skipped else []
+        if len(above) > 1 and not any(map(_is_value, above)):
+            hint = "Are there commas both in numbers and between columns? Quote the numbers, or use another separator."
+            if len(above) > len(header):
+                hint = "Is there a name too many, or do the rows end early?"
+            expected = f"{len(above)} cells, as in the header"
+            raise InvalidDataError(f"{name}, line {skipped + 1}", expected=expected, actual=str(len(header)), hint=hint)
         raise InvalidDataError(f"{name}, line {skipped + 1}", expected="a header", actual=f"{rows[0]}"[:200], hint=hint)
     first, units = skipped + 2, None
     if len(rows) > 2 and not any(map(_is_value, rows[1])) and any(map(_is_value, rows[2])):
-        units, first = [cell.strip(" []()") for cell in rows[1]], first + 1
-    comma = _has_decimal_comma(rows[1 if units is None else 2 :], separator)
+        first += 1
+        if rows[1] != rows[0]:  # else the header again
+            units = [cell.strip(" []()") for cell in rows[1]]
+    comma = _has_decimal_comma(rows[first - skipped - 1 :], separator)
     notes = [f"{encoding} text"] if encoding != "utf-8" else []
     notes += [f"columns separated by {_named(separator)}"] if separator != "," else []
     notes += ["decimal commas"] if comma else []
@@ -219,13 +250,34 @@ def _told(
     except pl.exceptions.PolarsError as error:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, delimiter=separator)
-            for row in reader:
+            for row in _until_broken(reader):
                 if reader.line_num >= first and len(row) > width:
                     hint = "Is a comma in a number or a name? Quote it, or use another separator."
                     expected = f"{width} cells, as in the header"
                     where = f"{name}, line {reader.line_num}"
                     raise InvalidDataError(where, expected=expected, actual=str(len(row)), hint=hint) from error
+        line = _open_quote(path, first)
+        if line:
+            hint = "Is a quotation mark missing, or one too many?"
+            raise InvalidDataError(
+                f"{name}, line {line}", expected="a quotation mark at the end of the cell", actual="none", hint=hint
+            ) from error
         raise InvalidDataError(name, expected="a table", actual=str(error).splitlines()[0][:200]) from error
+
+
+def _until_broken(reader: Iterator[list[str]]) -> Iterator[list[str]]:
+    """Rows until one that is longer than any."""
+    with suppress(csv.Error):
+        yield from reader
+
+
+def _open_quote(path: Path, first: int) -> int:
+    """The first line with a quotation mark that nothing closes; 0 for none."""
+    with path.open(encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, 1):
+            if number >= first and line.count('"') % 2:
+                return number
+    return 0
 
 
 def _layout(name: str, lines: list[str]) -> tuple[str, int]:

@@ -24,6 +24,7 @@ _DATES = (
     "%d-%m-%Y", "%d-%b-%Y", "%d-%b-%y", "%d %b %Y", "%b %d %Y", "%Y%m%d",
 )  # fmt: skip
 _CLOCKS = ("%H:%M:%S%.f", "%H:%M", "%I:%M:%S%.f %p", "%I:%M %p", "%H%M%S")
+_OF_DAY = r"^(\d{1,3}):([0-5]\d)(?::([0-5]\d(?:[.,]\d+)?))?$"
 _ENOUGH = 0.95  # share of a sample that a form must fit
 _SAMPLE = 1_000
 _YEARS = (1970, 2100)
@@ -42,6 +43,7 @@ class Clock:
     Attributes:
         absolute: Whether stamps are of a calendar; False of seconds from any beginning.
         zoned: Whether they say their distance from UTC.
+        unitless: Whether they are plain numbers, taken to be seconds.
         said: What was found out, in words.
     """
 
@@ -49,7 +51,8 @@ class Clock:
         self._where, self._unit, self._form = where, unit, form
         self._kind = ""
         self._scale = 1.0
-        self.absolute = self.zoned = False
+        self._last, self._days = -np.inf, 0  # of a clock without a date
+        self.absolute = self.zoned = self.unitless = False
         self.said = ""
 
     def seconds(self, columns: Sequence[Any], decimal_comma: bool) -> Array:
@@ -73,6 +76,8 @@ class Clock:
         if self._kind == "number":
             number = text.str.replace(",", ".", literal=True) if decimal_comma else text
             return self._of_numbers(np.asarray(number.cast(pl.Float64, strict=False).to_numpy(), dtype=np.float64))
+        if self._kind == "clock":
+            return self._of_day(text)
         return _epoch(_plain(text, self.zoned).str.to_datetime(self._form, time_unit="us", strict=False))
 
     def _of_numbers(self, numbers: Array) -> Array:
@@ -89,8 +94,26 @@ class Clock:
                 self.said = f"time since 1970 in {self._scale:g} s"
             else:
                 self.absolute = self.zoned = size > 6e8
+                self.unitless = not self.absolute
                 self.said = "time in s" + (" since 1970" if self.absolute else "")
         return numbers * self._scale
+
+    def _of_day(self, text: Any) -> Array:
+        """Seconds from the first midnight on, or elapsed ones; what is half a day before the last is a day later."""
+        pl = polars()
+        parts = text.str.extract_groups(_OF_DAY).struct.unnest()
+        hours, minutes, seconds = (
+            np.asarray(parts[name].str.replace(",", ".").cast(pl.Float64, strict=False).to_numpy(), np.float64)
+            for name in ("1", "2", "3")
+        )
+        t = 3600.0 * hours + 60.0 * minutes + np.nan_to_num(seconds)
+        known = np.flatnonzero(np.isfinite(t))
+        back = np.diff(np.append(self._last, t[known])) < -43_200.0
+        if len(known):
+            self._last = float(t[known[-1]])
+        t[known] += 86_400.0 * (self._days + np.cumsum(back))
+        self._days += int(back.sum())
+        return np.asarray(t)
 
     def _find(self, text: Any, decimal_comma: bool) -> None:
         """The form of the first rows."""
@@ -102,8 +125,11 @@ class Clock:
         if self._form is None and number.cast(pl.Float64, strict=False).is_not_null().mean() >= _ENOUGH:
             self._kind = "number"
             return
+        if self._form is None and sample.str.contains(_OF_DAY).mean() >= _ENOUGH:
+            self._kind, self.said = "clock", "time of day, from day to day"
+            return
         self.absolute, self._kind = True, "text"
-        ends = r"([+-]\d{2}:?\d{2}|Z)$"
+        ends = r"([+-]\d{2}:?\d{2}|Z|UTC|GMT)$"
         self.zoned = bool(sample.str.contains(ends).mean() >= _ENOUGH and sample.str.contains(":").all())
         sample = _plain(sample, self.zoned)
         suffix = "%#z" if self.zoned else ""
@@ -121,7 +147,13 @@ class Clock:
                 fitting[form] = _epoch(parsed)
         if not fitting:
             shown = f"{sample[0]!r:.60}"
+            digits = sample.str.replace_all(r"\d", "0").str.replace_all(r"[A-Za-z]+", "a")
+            other = sample.filter(digits != digits[0])
+            if len(other) and not self._form:
+                shown += f", and further on {other[0]!r:.60}"
             hint = "time_format= says how they are written, as in '%d.%m.%Y %H:%M:%S'."
+            if sample.str.contains(r" [A-Z]{3,4}$").mean() >= _ENOUGH:
+                hint = "Leave out the zone's name, and give timezone= as 'Europe/Berlin'."
             raise InvalidDataError(self._where, expected="time stamps of a usual form", actual=shown, hint=hint)
         self._form = _likeliest(fitting)
         self.said = f"time stamps as {self._form.replace('%#z', '%z').replace('%.f', '')}"
@@ -143,7 +175,7 @@ def _plain(text: Any, zoned: bool) -> Any:
     text = text.str.replace(r":(\d{2}),(\d+)", ":${1}.${2}")
     text = text.str.replace(r"\s+", " ")
     if zoned:
-        text = text.str.replace(r"\s*Z$", "+0000").str.replace(r"\s*([+-]\d{2}):?(\d{2})$", "${1}${2}")
+        text = text.str.replace(r"\s*(Z|UTC|GMT)$", "+0000").str.replace(r"\s*([+-]\d{2}):?(\d{2})$", "${1}${2}")
     return text
 
 

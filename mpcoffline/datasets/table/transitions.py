@@ -19,6 +19,7 @@ from .centring import Centring
 from .math import CHUNK, Columns, Episodes, TableStatistics, innermost, moments, split
 from .numbers import check_bounds, check_sizes
 from .sampler import block_batches, gather_batches
+from .shown import html_of_rows
 
 __all__ = ["Columns", "Episodes", "TableStatistics", "TransitionTable"]
 
@@ -35,10 +36,8 @@ class TransitionTable:
     in float64; all others are float32 views of the rows.
 
     One packed row a transition makes a random minibatch one contiguous gather a row, an order of magnitude
-    faster than gathering five arrays. Everything here speaks cost L; a reward changes its sign in
-    :meth:`from_minari` and nowhere else. A time-limit truncation is not a termination: learning
-    bootstraps from its s+.
-
+    faster than gathering five arrays. Everything here speaks cost L; a reward changes its sign in :meth:`from_minari`
+    and nowhere else. A time-limit truncation is not a termination: learning bootstraps from its s+.
     Build one with :meth:`from_arrays` or :meth:`from_minari`, which check what they are given.
 
     Args:
@@ -90,6 +89,9 @@ class TransitionTable:
     def __repr__(self) -> str:
         return f"TransitionTable({self.name!r}, n={len(self)}, ny={self.ny}, nu={self.nu})"
 
+    def _repr_html_(self) -> str:
+        return html_of_rows(self)
+
     @property
     def observations(self) -> NDArray[np.floating[Any]]:
         """Observations s ``(n, ny)``: a view, or where they are centred a copy in float64."""
@@ -127,9 +129,7 @@ class TransitionTable:
         return Episodes(*np.unique(self.episode_ids, return_index=True, return_counts=True))
 
     def columns(self, block: Any) -> Columns:
-        """The five columns of a block of rows (a minibatch, or all rows) in units.
-
-        Views of it, but where the table is centred, copies in float64.
+        """The five columns of a block of rows in units: views of it; where the table is centred, copies in float64.
 
         Args:
             block: ``(B, 2 ny + nu + 2)``, a numpy array or a torch tensor.

@@ -12,7 +12,16 @@ import pytest
 from tank_logs import START, Log, simulated, stamps, text
 from two_tanks import two_tanks
 
-from mpcoffline import InvalidArgumentError, InvalidDataError, MPCOfflineError, Plant, Signal, StorageError
+from mpcoffline import (
+    Input,
+    InvalidArgumentError,
+    InvalidDataError,
+    MPCOfflineError,
+    Plant,
+    Signal,
+    State,
+    StorageError,
+)
 
 pl = pytest.importorskip("polars")
 LOG = simulated()
@@ -334,6 +343,32 @@ def test_without_time_rows_are_dt_apart_and_that_is_said(plant: Plant) -> None:
     table = plant.read({"h1": LOG.h1, "h2": LOG.h2, "pump": LOG.pump, "set_point": LOG.set_point})
     same(table, LOG)
     assert "no column of time was found: rows are taken to be 5 s apart" in str(table.report)
+
+
+def test_a_quantity_that_is_called_like_a_time_is_none() -> None:
+    states = [State("T", "degC"), State("t", "degC")]
+    plant = Plant(
+        "oven",
+        dt=2.0,
+        states=states,
+        inputs=[Input("u", low=0, high=1)],
+        dynamics=lambda x, u: [u.u, x.T - x.t],
+        cost={"T": 1.0},
+    )
+    rows = {"T": [20.0, 30.0, 25.0], "t": [1.0, 2.0, 4.0], "u": [0.1, 0.2, 0.3]}
+    table = plant.read(rows)
+    assert "no column of time was found: rows are taken to be 2 s apart" in table.report.notes
+    np.testing.assert_allclose(table.observations, [[20, 1], [30, 2]])
+    assert "time in s" in " ".join(plant.read(rows | {"time": [0, 2, 4]}).report.notes)
+
+
+def test_a_signal_far_from_its_range_is_refused_and_one_about_it_noted(plant: Plant) -> None:
+    frame = {"time": LOG.t, "h1": LOG.h1, "h2": LOG.h2, "pump": LOG.pump, "set_point": 10.0 * LOG.set_point}
+    with pytest.raises(InvalidDataError, match=r"row 0: set_point: expected values from 5 to 20 cm, got 100"):
+        plant.read(frame)
+    table = plant.read(frame | {"set_point": np.where(LOG.t < 30.0, 25.0, LOG.set_point)})
+    assert "set_point is outside its range, 5 to 20 cm, in 10% of the rows" in table.report.notes
+    assert len(table) == 59
 
 
 def test_columns_and_units_may_be_said(plant: Plant, tmp_path: Path) -> None:
