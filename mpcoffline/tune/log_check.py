@@ -47,11 +47,13 @@ class Remark:
         kind: ``"problem"``: mend it first; ``"advice"``: better with it; ``"good"``.
         about: What it is about: a section of the page.
         text: The sentence.
+        forbids: Whether nothing can be fitted before it is mended.
     """
 
     kind: Kind
     about: str
     text: str
+    forbids: bool = False
 
     def __str__(self) -> str:
         return self.text
@@ -77,9 +79,9 @@ class LogCheck:
     delays: DelaySearch | None = None
     experiments: dict[str, Experiment | None] = field(default_factory=dict)
 
-    def add(self, kind: Kind, about: str, text: str) -> None:
+    def add(self, kind: Kind, about: str, text: str, *, forbids: bool = False) -> None:
         """Enters a remark."""
-        self.remarks.append(Remark(kind, about, text))
+        self.remarks.append(Remark(kind, about, text, forbids))
 
     @property
     def problems(self) -> list[Remark]:
@@ -136,8 +138,9 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
             found.add("problem", each.what, f"{each.why}, {each.count} rows from {each.first} on: is its sensor well?")
     findings = check(mpc, table)
     for finding in findings.findings:
-        found.add("problem", "description and data", str(finding))
-    _coverage(plant, table, found)
+        found.add("problem", "description and data", str(finding), forbids=finding in findings.errors)
+    if (table.ny, table.nu) == (mpc.ny, mpc.nu):
+        _coverage(plant, table, found)
     if findings.errors:
         return found
     with _quiet():
@@ -145,7 +148,7 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
             mpc = _dead_time(plant, mpc, table, found, seed)
             found.identification = identify(mpc, table, seed=seed)
         except InvalidDataError as error:
-            found.add("problem", "identification", str(error))
+            found.add("problem", "identification", str(error), forbids=True)
             return found
     _parameters(plant, mpc, table, found)
     _noise(plant, found)

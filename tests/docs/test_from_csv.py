@@ -10,6 +10,7 @@ import pytest
 from tank_logs import simulated, text
 from typer.testing import CliRunner
 
+import mpcoffline.tune as tune_module
 from mpcoffline.cli import app
 
 pytest.importorskip("polars")
@@ -30,8 +31,12 @@ def test_its_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     names: dict[str, Any] = {"learner": Learner()}
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
+    whole = tune_module.tune
+    monkeypatch.setattr(tune_module, "tune", lambda *given: whole(*given, preset="fast", value_n_steps=60))
     for block in blocks:
         exec(block, names)
+    assert names["tuned"].folder == Path("tuned")
+    assert names["policy"].mpc.model.space.names == ["k", "c1", "c2"]
     assert names["learner"].rows == 59
     assert names["env"].spec.id == "plants/TwoTanks-v0"

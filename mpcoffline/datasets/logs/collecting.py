@@ -150,7 +150,7 @@ def _collect(
 ) -> None:
     """The rows of one log."""
     columns = {name: Column(each) for name, each in found(source, quantities, options.columns, options.units).items()}
-    stamps, clock = _clock(source, options)
+    stamps, clock = _clock(source, options, {column.found.place for column in columns.values()})
     places = [(place_of(source, name, name)[0], values) for name, values in options.where.items()]
     episode = None if options.episode is None else place_of(source, options.episode, options.episode)[0]
     parts.files.append((parts.rows, source))
@@ -189,15 +189,18 @@ def _collect(
     parts.zoned |= clock is not None and clock.zoned
 
 
-def _clock(source: Source, options: Options) -> tuple[list[int], Clock | None]:
-    """The columns of the time, and what reads them; none where there is no such column."""
+def _clock(source: Source, options: Options, taken_by: set[int]) -> tuple[list[int], Clock | None]:
+    """The columns of the time, and what reads them; none where there is no such column.
+
+    Without an option it is no column that a quantity has, as T of a temperature.
+    """
     if options.time is not None:
         names = [options.time] if isinstance(options.time, str) else list(options.time)
         found_ones = [place_of(source, name, name) for name in names]
     else:
         taken: dict[str, int] = {}
         for i, header in enumerate(source.header):
-            for reading in readings(header):
+            for reading in readings(header) if i not in taken_by else ():
                 taken.setdefault(reading.name.casefold().strip(), i)
         first = next((name for name in NAMES if name in taken), None)
         if first is None:
