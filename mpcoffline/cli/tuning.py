@@ -1,4 +1,4 @@
-"""The commands that end with a controller of one's own: ``mpcoffline tune``."""
+"""The commands that end with a controller of one's own: ``mpcoffline tune`` and ``mpcoffline retune``."""
 
 from __future__ import annotations
 
@@ -88,6 +88,44 @@ def tune(
         _tell("What was finished is kept: the same command goes on from there.")
         raise
     _show(result, as_json)
+
+
+@app.command(epilog=examples("mpcoffline retune tuned/ trial.csv", "mpcoffline retune tuned/ a.csv b.csv --json"))
+def retune(
+    folder: Annotated[Path, typer.Argument(metavar="TUNED", help="The folder of tune.", exists=True, file_okay=False)],
+    trial: Logs,
+    column: Columns = None,
+    unit: Units = None,
+    where: Where = None,
+    time: Time = None,
+    time_format: TimeFormat = None,
+    timezone: Timezone = None,
+    episode: Episode = None,
+    max_gap: MaxGap = None,
+    as_json: Json = False,
+) -> None:
+    """Learn from a trial, too, and say whether it cost what was predicted.
+
+    Reads the log of a trial with the tuned controller: one of `mpcoffline serve`, or one like that given to tune, whose
+    options hold for it, too. Simulates the trial on the models of the log before it, and compares; then fits again with
+    both logs. The folder is replaced as a whole; what it held is kept in a numbered one inside.
+    """
+    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
+    _tell(f"Reading {', '.join(log.name for log in trial)}")
+    from mpcoffline.tune import retune as retuned
+    from mpcoffline.tune.retuning import trial_lines
+
+    try:
+        result = retuned(folder, trial, read=options, tell=_tell)
+    except KeyboardInterrupt:
+        _tell("What was finished is kept: the same command goes on from there.")
+        raise
+    if not as_json:
+        far = result.calibration is not None and result.calibration.far
+        head, *rest = trial_lines(result.tuned.document)
+        console.print(Text(visible(head), style="bold red" if far else "bold"), soft_wrap=True)
+        console.print(Text(visible("\n".join(rest)) + "\n"), soft_wrap=True)
+    _show(result.tuned, as_json)
 
 
 def _tell(text: str) -> None:

@@ -105,18 +105,8 @@ class LogCheck:
             if chosen:
                 lines += [f"{title}:", *(f"* {each.about}: {each.text}" for each in chosen), ""]
         for table in self.tables:
-            lines += [table.title, *(_plain(table)), ""]
+            lines += [*table.lines, ""]
         return "\n".join(lines).rstrip()
-
-
-def _plain(table: Table) -> list[str]:
-    rows = [list(table.header), *map(list, table.rows)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(table.header))]
-    right = [(table.align[min(i, len(table.align) - 1)] == "r") for i in range(len(widths))]
-    return [
-        "  ".join(c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True)).rstrip()
-        for row in rows
-    ]
 
 
 def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogCheck:

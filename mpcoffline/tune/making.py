@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from mpcoffline.solvers.ddp.build import CompilerError
 from .folder import CHECKPOINT, CODE, LEARNER, LOG, PAGE, PLANT, POLICY, Workplace, versions
 
 KEEP = "keep MPC_1"
+RUNNING = "running"  # the controller of a trial, among the candidates
 
 #: Is told what is done now.
 Tell = Callable[[str], None]
@@ -42,6 +43,8 @@ class Order:
         options: Of the learner: ``preset``, ``learn``, ``polish``, ``seed``.
         also: Further controllers that are tried beside what is learned, by name.
         sections: Further parts of the page.
+        today: How many episodes, the first ones, were made by the controller that runs today; all by default.
+        doubt: Why nothing may be recommended whatever the models say; empty where nothing speaks against it.
     """
 
     plant: str
@@ -51,6 +54,8 @@ class Order:
     options: Mapping[str, Any]
     also: Mapping[str, MPC] = field(default_factory=dict)
     sections: Sequence[Section] = ()
+    today: int | None = None
+    doubt: str = ""
 
 
 def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> dict[str, Any]:
@@ -77,7 +82,10 @@ def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> 
 
     def judged() -> dict[str, Any]:
         tell("Judging: closed loops on models of the log")
-        report = diagnose(learner, order.table, seed=order.options["seed"])
+        report = diagnose(learner, order.table, seed=order.options["seed"], today=order.today)
+        if order.doubt and report.verdict != KEEP:
+            judgement, reasons = report.judgement, (order.doubt, *report.reasons)
+            report = replace(report, judgement=replace(judgement, verdict="try with care", reasons=reasons))
         report.html(path / PAGE, title=order.plant, sections=order.sections)
         return _judgement(report, learner)
 

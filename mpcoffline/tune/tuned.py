@@ -13,13 +13,15 @@ from typing import Any, Self
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.archive import file_errors
+from mpcoffline.core.errors import FileFormatError
+from mpcoffline.core.tables import Table
 from mpcoffline.datasets.table.files import load_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.simulation.choice import FIRST
 
 from .folder import LEARNER, LOG, PAGE, POLICY, RUN, read_run
-from .making import KEEP
+from .making import KEEP, RUNNING
 
 _WIDTH = 84
 
@@ -45,10 +47,13 @@ class Tuned:
         """What a folder holds.
 
         Raises:
-            FileNotFoundError: If it is none of ``tune``.
-            FileFormatError: If it is damaged or of another version.
+            FileFormatError: If it is none of ``tune``, damaged, or of another version.
         """
-        document = read_run(folder)
+        try:
+            document = read_run(folder)
+        except (FileNotFoundError, NotADirectoryError) as error:
+            expected, hint = "a folder that tune has made", "`mpcoffline tune PLANT.py LOG` makes one."
+            raise FileFormatError(str(folder), expected=expected, actual=f"no {RUN} in it", hint=hint) from error
         with file_errors(Path(folder) / RUN):
             _ = [str(each) for each in (*document["reasons"], document["verdict"], document["policy"])]
             _ = [document["costs"], document["episode_steps"], document["options"], document["rows"]]
@@ -77,6 +82,8 @@ class Tuned:
     @property
     def policy_is(self) -> str:
         """What ``policy.zip`` is, in words."""
+        if self.document["policy"] == RUNNING:
+            return "the controller of the trial as it was: nothing better was learned"
         if self.document["policy"] != FIRST:
             return f"the proposal, {self.document['policy']!r}"
         if self.document["proposal"] == FIRST:
@@ -84,17 +91,11 @@ class Tuned:
         return "MPC_1, the controller of the plant file as it is; what was learned is in learner.zip, not recommended"
 
     @property
-    def costs(self) -> str:
-        """Today, MPC_1 and the proposal in a small table."""
-        steps, costs = self.document["episode_steps"], self.document["costs"]
-        rows = [["", "lowest", "expected", "highest"]]
-        rows += [[name, *(_number(cost[key]) for key in rows[0][1:])] for name, cost in costs.items()]
-        widths = [max(len(row[i]) for row in rows) for i in range(4)]
-        lines = [
-            "  " + "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))])
-            for row in rows
-        ]
-        return "\n".join([f"Cost of an episode of {steps} steps:", *lines])
+    def costs(self) -> Table:
+        """Today, MPC_1 and the proposal."""
+        ends = ("lowest", "expected", "highest")
+        rows = [(name, *(_number(cost[end]) for end in ends)) for name, cost in self.document["costs"].items()]
+        return Table(("", *ends), rows, f"Cost of an episode of {self.document['episode_steps']} steps:", "lr")
 
     @property
     def next_steps(self) -> tuple[str, ...]:
@@ -116,7 +117,7 @@ class Tuned:
     def __str__(self) -> str:
         """Verdict, files and what to do next."""
         d, at = self.document, self.folder
-        lines = [f"Verdict: {self.verdict}", *map(_item, d["reasons"]), self.costs, "Files:"]
+        lines = [f"Verdict: {self.verdict}", *map(item, d["reasons"]), *self.costs.lines, "Files:"]
         code = f"{d['controller']}/" if d.get("controller") else None
         files = [(PAGE, "the report, for a browser"), (POLICY, self.policy_is), (LEARNER, "all that was learned")]
         files += [(code, f"{POLICY} as C99")] if code else []
@@ -124,7 +125,7 @@ class Tuned:
         width = max(len(name) for name, _ in files)
         lines += [f"  {at}{os.sep}{name.ljust(width)}  {text}" for name, text in files]
         if not code:
-            lines.append(_item(f"No C code: {d['why_no_controller']}"))
+            lines.append(item(f"No C code: {d['why_no_controller']}"))
         if self.former is not None:
             lines.append(f"  {at}{os.sep}{f'{self.former.name}/'.ljust(width)}  what was here before")
         first, *rest = self.next_steps
@@ -135,5 +136,6 @@ def _number(value: Any) -> str:
     return "?" if value is None else f"{value:.4g}"
 
 
-def _item(text: str) -> str:
+def item(text: str) -> str:
+    """A list item, wrapped."""
     return textwrap.fill(text, _WIDTH, initial_indent="  - ", subsequent_indent="    ", break_on_hyphens=False)

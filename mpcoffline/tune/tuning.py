@@ -15,7 +15,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
 from mpcoffline.plants import Plant
 
-from .folder import Workplace, identity_of
+from .folder import Workplace, identity_of, read_run
 from .log_check import LogCheck, check_log
 from .making import Order, Tell, check_options, made
 from .tuned import Tuned
@@ -97,7 +97,7 @@ def tune(
     order = Order(plant.name, reader, mpc, table, options, sections=[_section(table, said)])
     document = made(order, place, tell, show_progress=show_progress) | {"check": said, **_read_as(table)}
     former = place.finish(document)
-    return Tuned(place.folder, document, former=former)
+    return Tuned(place.folder, read_run(place.folder), former=former)
 
 
 def _said(found: LogCheck) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planted_logs import heater, logged, tanks
+from planted_logs import heater, short_episodes, tanks
 from typer.testing import CliRunner
 
-from mpcoffline import InvalidArgumentError, InvalidDataError, OfflineMPCLearner, StorageError
+from mpcoffline import FileFormatError, InvalidArgumentError, InvalidDataError, OfflineMPCLearner, StorageError
 from mpcoffline.cli import app
 from mpcoffline.datasets.table.files import hash_of, load_table
 from mpcoffline.tune import Tuned, making, tune
@@ -20,13 +20,7 @@ from mpcoffline.tune import Tuned, making, tune
 pytest.importorskip("polars")
 
 
-def log_of(seed: int) -> dict[str, Any]:
-    """Five short episodes."""
-    log = logged("heater", seed, 200)
-    return log | {"time": log["time"] + 100.0 * (np.arange(200) // 40)}
-
-
-LOG = log_of(21)
+LOG = short_episodes(21)
 QUICK: dict[str, Any] = {"preset": "fast", "value_n_steps": 60, "show_progress": False}
 FILES = {"report.html", "policy.zip", "learner.zip", "controller", "log.zip", "plant.json", "run.json"}
 
@@ -110,7 +104,7 @@ def test_another_log_starts_anew_and_what_was_there_is_kept(tmp_path: Path, monk
         return replace(report, judgement=replace(report.judgement, verdict="keep MPC_1"))
 
     monkeypatch.setattr(making, "diagnose", kept)
-    second = tuned_in(tmp_path, log_of(4))
+    second = tuned_in(tmp_path, short_episodes(4))
     assert second.former == place / "1"
     assert names(place / "1") == FILES
     assert (place / "1" / "policy.zip").read_bytes() == policy
@@ -143,7 +137,7 @@ def test_a_damaged_table_is_refused(once: Tuned, tmp_path: Path) -> None:
     file.write_bytes((once.folder / "log.zip").read_bytes()[:-40])
     with pytest.raises(ValueError, match=r"log.zip"):
         load_table(file)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileFormatError, match=r"a folder that tune has made, got no run.json in it"):
         Tuned.load(tmp_path)
 
 
