@@ -158,9 +158,9 @@ def read_options(
 ) -> dict[str, Any]:
     """The options of :meth:`mpcoffline.Plant.read` from those of a command."""
     return {
-        "columns": _pairs("--column", column),
-        "units": _pairs("--unit", unit),
-        "where": _pairs("--where", where),
+        "columns": pairs("--column", column),
+        "units": pairs("--unit", unit),
+        "where": pairs("--where", where),
         "time": None if not time else time if len(time) > 1 else time[0],
         "time_format": time_format,
         "timezone": timezone,
@@ -169,7 +169,7 @@ def read_options(
     }
 
 
-def _pairs(option: str, given: list[str] | None) -> dict[str, str]:
+def pairs(option: str, given: list[str] | None) -> dict[str, str]:
     """NAME=VALUE, several of them."""
     found = {}
     for each in given or []:

@@ -50,8 +50,8 @@ def refused(*arguments: str | Path) -> str:
 
 
 COMMANDS = [
-    "run", "reproduce", "collect", "new", "check", "tune", "retune", "learn", "evaluate", "diagnose", "plot", "export",
-    "clean", "doctor",
+    "run", "reproduce", "collect", "new", "check", "tune", "retune", "serve", "learn", "evaluate", "diagnose", "plot",
+    "export", "clean", "doctor",
 ]  # fmt: skip
 DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
 

@@ -33,7 +33,7 @@ def test_its_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     names: dict[str, Any] = {"learner": Learner()}
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 6
     given: list[tuple[Any, ...]] = []  # both have tests of their own, of a minute
 
     def stand_in(*arguments: Any) -> Any:
@@ -47,6 +47,7 @@ def test_its_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for block in blocks:
         exec(block, names)
     assert given == [(names["plant"], names["table"], "tuned"), ("tuned", "trial.csv")]
-    assert names["policy"] == "policy.zip"
+    assert names["stats"].periods + names["stats"].skipped == 5
+    assert len(Path("served.csv").read_text().splitlines()) == 1 + names["stats"].periods
     assert names["learner"].rows == 59
     assert names["env"].spec.id == "plants/TwoTanks-v0"
