@@ -128,9 +128,10 @@ def diagnose(
         n_steps=n_steps,
         seed=seed + _FRESH,
     )
-    own = _of_today(table, today)
-    clone = Behaviour.of(table if own.all() else table.take(np.flatnonzero(own)), learned.layout, seed)
-    deviations = clone.deviations(table, around.rows, around.n_steps)
+    logs = around.logged
+    own = _of_today(logs, today)
+    clone = Behaviour.of(logs if own.all() else logs.take(np.flatnonzero(own)), learned.layout, seed)
+    deviations = clone.deviations(logs, around.rows, around.n_steps)
     others = ~own[around.rows]  # of which nobody knows what today's controller would have done beside
     deviations[others], around.returns[others] = 0.0, np.nan
     trials, loops = _tried(chosen, lambda starts: {**policies, TODAY: clone.replaying(deviations[starts])}, around)
@@ -139,9 +140,9 @@ def diagnose(
     rows, acting = around.rows[usual], clone.replaying(deviations[usual])
     trust = None
     if len(rows):
-        trust = _trust(agreement(around.models, around.cost, table, acting, rows, around.n_steps), trials.votes)
+        trust = _trust(agreement(around.models, around.cost, logs, acting, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
-    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, table, learned.layout, around)
+    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(

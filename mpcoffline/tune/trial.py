@@ -205,10 +205,10 @@ def compared(
     layout, nominal = learned.layout, given.with_delay(learned.layout.delay)
     table, tried = with_memory(log, layout), with_memory(trial, layout)
     known = None if learner.result is None else learner.result.cost
-    found, _ = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
     policies = {TRIED: quick_policy(running), FIRST: quick_policy(given)}
     slow = are_slow(policies.values())
-    around, starts = _surroundings(learned, given, log, table, tried, found, slow, seed + _TRIAL)
+    around, starts = _surroundings(learned, given, (log, table, clean), tried, found, slow, seed + _TRIAL)
     own = np.ones(len(table), dtype=bool) if today is None else np.asarray(table.episode_ids) < today
     clone = Behaviour.of(table.take(np.flatnonzero(own)) if own.any() else table, layout, seed)
     n, votes, steps = len(starts), around.models.votes, around.n_steps
@@ -229,14 +229,17 @@ def compared(
 def _surroundings(
     learned: MPC,
     given: MPC,
-    log: TransitionTable,
-    table: TransitionTable,
+    logs: tuple[TransitionTable, TransitionTable, TransitionTable],
     tried: TransitionTable,
     found: Identification,
     slow: bool,
     seed: int,
 ) -> tuple[Surroundings, NDArray[np.intp]]:
-    """Models of the log, begun where stretches of the trial do, several times each; and where these begin."""
+    """Models of the log, begun where stretches of the trial do, several times each; and where these begin.
+
+    ``logs`` are the log, the same with past inputs, and that without measurement noise.
+    """
+    log, table, clean = logs
     loops = _FEW_LOOPS if slow else _LOOPS
     usual = surroundings_of(learned, given, log, found, slow=slow, n_starts=1, seed=seed)
     rng, longest = np.random.default_rng(seed), int(table.episodes.lengths.max())
@@ -246,7 +249,7 @@ def _surroundings(
     _, firsts, lengths = table.episodes
     whole = np.concatenate([np.arange(a, a + n - steps + 1) for a, n in zip(firsts, lengths, strict=True)])
     rows = rng.choice(whole, size=times * len(starts), replace=len(whole) < times * len(starts))
-    around = Surroundings(usual.models, usual.cost, table, rows, steps, learned.layout, seed)
+    around = Surroundings(usual.models, usual.cost, clean, rows, steps, learned.layout, seed, logged=table)
     states = np.tile(tried.values().observations[starts], (times, 1))
     n, noise = learned.layout.n_states, usual.models.noise  # of the sensors: where a stretch began is not known exactly
     states[:, :n] += noise * rng.standard_normal((len(states), n))
