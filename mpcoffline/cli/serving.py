@@ -122,7 +122,8 @@ def serve(
         say(f"Log: [bold]{escape(str(log))}[/]")
         folder = policy.parent
         if (folder / "run.json").is_file():
-            say(f"Next: mpcoffline retune {escape(str(folder))} {escape(str(log))}")
+            others = " --where decided_by=policy" if stats.decided < stats.periods else ""
+            say(f"Next: mpcoffline retune {escape(str(folder))} {escape(str(log))}{others}")
 
 
 def _numbers(given: dict[str, str]) -> dict[str, float]:

@@ -67,7 +67,9 @@ def test_a_trial_of_the_same_plant_costs_what_was_predicted_and_is_learned_from(
     former = Tuned.load(copied / "1")
     assert former.document["identity"] == tuned.document["identity"]
     assert after.tuned.document["today"] == tuned.table.n_episodes == 5
-    assert "running" in after.tuned.learner.candidates or after.tuned.document["policy"] != "running"  # type: ignore[operator]
+    candidates = after.tuned.learner.candidates
+    assert candidates is not None
+    assert np.array_equal(candidates["running"].theta, tuned.policy.mpc.theta)
     page = (copied / "report.html").read_text(encoding="utf-8")
     assert page.index("The trial: predicted and seen") < page.index("What would change")
     # Once more, it is known.
