@@ -44,7 +44,8 @@ class Workplace:
     @property
     def path(self) -> Path:
         """Where it is made until it is complete."""
-        return self.folder.with_name(f"{self.folder.name}.unfinished")
+        whole = self.folder if self.folder.name.strip(".") else self.folder.resolve()
+        return whole.with_name(f"{whole.name}.unfinished")
 
     @property
     def finished(self) -> dict[str, Any] | None:
@@ -65,19 +66,13 @@ class Workplace:
             StorageError: If the folder, or what has the name of the workplace, is something else.
         """
         if self.folder.exists() and not is_tuned(self.folder) and (not self.folder.is_dir() or any_in(self.folder)):
-            hint = "Name another folder, or move that one away."
-            raise StorageError(
-                f"folder {self.folder}", expected="a tuned one, an empty one or none", actual="another", hint=hint
-            )
+            raise _taken(self.folder, "a tuned one, an empty one or none")
         check_output_folder(self.path)
         mark = self.path / BEGUN
-        if self.path.exists() and any_in(self.path):
-            if not mark.is_file():
-                hint = "Move it away."
-                raise StorageError(
-                    f"folder {self.path}", expected="none, or an unfinished one", actual="another", hint=hint
-                )
-            if read_json(mark).get("identity") == self.identity:
+        if self.path.exists() and (not self.path.is_dir() or any_in(self.path)):
+            if not mark.is_file() and not is_tuned(self.path):
+                raise _taken(self.path, "an unfinished one of tune, or none")
+            if mark.is_file() and read_json(mark).get("identity") == self.identity:
                 return True
             shutil.rmtree(self.path)
         make_folder(self.path)
@@ -106,8 +101,6 @@ class Workplace:
             Where what was there is now; None where there was nothing.
         """
         write_file(self.path / RUN, json.dumps(plain(dict(document) | self._mark), indent=2, allow_nan=False) + "\n")
-        for path in (self.path / BEGUN, self.path / CHECKPOINT, *self.path.glob(f"*{_STEP}")):
-            path.unlink(missing_ok=True)
         former = None
         if is_tuned(self.folder):
             kept = numbered(self.folder)
@@ -115,6 +108,8 @@ class Workplace:
                 _link(folder, self.path / str(number))
             former = str(max(kept, default=0) + 1)
             _link(self.folder, self.path / former, frozenset(map(str, kept)))
+        for path in (self.path / BEGUN, self.path / CHECKPOINT, *self.path.glob(f"*{_STEP}")):
+            path.unlink(missing_ok=True)
         publish(self.path, self.folder, overwrite=True)
         return None if former is None else self.folder / former
 

@@ -20,7 +20,7 @@ from mpcoffline.simulation.choice import FIRST
 
 from .folder import PLANT, RUN, Workplace, identity_of, read_run
 from .making import RUNNING, Order, Tell, made
-from .trial import Calibration, compared
+from .trial import Band, Calibration, compared
 from .tuned import Tuned, item
 
 _DOUBT = (
@@ -83,28 +83,22 @@ def retune(
     reader, name = _reader(before)
     table = read_log(trial, reader, _options(before, trial, read))
     tell(f"{len(table):,} control intervals of {reader.dt:g} s, {table.n_episodes} without a gap")
-    sha, history = hash_of(table), list(before.document.get("trials", []))
+    sha, (options, expected, today, history) = hash_of(table), _of_before(before)
     if sha in [each["sha256"] for each in history]:
         tell("This trial has been learned from already")
         return Retuned(Tuned(before.folder, before.document, again=True), None)
-    options = dict(before.document["options"])
     place = Workplace(before.folder, identity_of(before=before.document["identity"], trial=sha))
     if place.begin():
         tell(f"Going on with {place.path}")
     learner, log, running = before.learner, before.table, before.policy.mpc
-    today = int(before.document.get("today", log.n_episodes))
-    tell("Comparing the trial with what was predicted")
-    cost = before.document["costs"].get(before.document["policy"], {})
-    expected = tuple(_number(cost.get(key)) for key in ("lowest", "expected", "highest"))
-    calibration = compared(
-        learner,
-        running,
-        log,
-        table,
-        expected=(expected, int(before.document["episode_steps"])),  # type: ignore[arg-type]
-        today=today,
-        seed=options["seed"],
-    )
+    today = log.n_episodes if today is None else today
+
+    def tried() -> dict[str, Any]:
+        tell("Comparing the trial with what was predicted")
+        found = compared(learner, running, log, table, expected=expected, today=today, seed=options["seed"])
+        return found.to_json()
+
+    calibration = Calibration.from_json(place.once("trial", tried))
     history.append({"sha256": sha, "rows": len(table), "controller": before.document["policy"]} | calibration.to_json())
     both = TransitionTable.concat([log, table])
     also = {} if before.document["policy"] == FIRST else {RUNNING: running}
@@ -145,8 +139,22 @@ def _options(before: Tuned, trial: Any, read: Mapping[str, Any] | None) -> Optio
         return Options(**stored["options"])
 
 
-def _number(value: Any) -> float:
-    return float("nan") if value is None else float(value)
+def _of_before(before: Tuned) -> tuple[dict[str, Any], tuple[Band, int], int | None, list[dict[str, Any]]]:
+    """Options, expected cost and in how many steps, how many episodes are today's controller's, trials so far.
+
+    Raises:
+        FileFormatError: If the folder says something else.
+    """
+    with file_errors(before.folder / RUN):
+        document = before.document
+        options, today, history = dict(document["options"]), document.get("today"), list(document.get("trials", []))
+        _ = options["seed"], [each["sha256"] for each in history], [each["off"] for each in history]
+        cost = document["costs"].get(document["policy"], {})
+        low, middle, high = (
+            float("nan") if cost.get(end) is None else float(cost[end]) for end in ("lowest", "expected", "highest")
+        )
+        steps = int(document["episode_steps"])
+        return options, ((low, middle, high), steps), None if today is None else int(today), history
 
 
 def _section(calibration: Calibration, history: list[dict[str, Any]]) -> Section:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.tables import Table
+from mpcoffline.core.text import figure
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -92,10 +93,10 @@ class Calibration:
             return ("Nothing was predicted: no model of the log before predicts it. What was seen stands alone.",)
         low, middle, high = self.band
         head = (
-            f"The trial cost {self.seen:.4g} in {self.steps} steps (mean of {self.stretches}); predicted were"
-            f" {middle:.4g}, {low:.4g} to {high:.4g}:"
+            f"The trial cost {figure(self.seen, 4)} in {self.steps} steps (mean of {self.stretches}); predicted were"
+            f" {figure(middle, 4)}, {figure(low, 4)} to {figure(high, 4)}:"
         )
-        difference = f"{abs(self.seen - middle):.3g} {'more' if self.seen > middle else 'less'} than the middle"
+        difference = f"{figure(abs(self.seen - middle))} {'more' if self.seen > middle else 'less'} than the middle"
         if self.inside:
             found = [f"{head} inside the band, {difference}. The models told what this controller does on the plant."]
         elif not self.far:
@@ -125,7 +126,8 @@ class Calibration:
             return ()
         low, _, high = self.predicted[TODAY]
         where = "less" if self.seen < low else "more" if self.seen > high else "neither clearly less nor more"
-        return (f"That is {where} than today's controller costs there on the models, {low:.4g} to {high:.4g}.",)
+        span = f"{figure(low, 4)} to {figure(high, 4)}"
+        return (f"That is {where} than today's controller costs there on the models, {span}.",)
 
     def _of_others(self) -> tuple[str, ...]:
         if self.others <= _DECIDED:
@@ -140,9 +142,9 @@ class Calibration:
     def table(self) -> Table:
         """Predicted and seen, a row each."""
         shown = {"expected by the verdict, from its own log": self.promised} if self.promised is not None else {}
-        rows = [(name, *(f"{v:.4g}" for v in band)) for name, band in shown.items() if band is not None]
-        rows += [(f"predicted here: {name}", *(f"{v:.4g}" for v in band)) for name, band in self.predicted.items()]
-        rows.insert(1 + len(shown), ("seen in the trial", "", f"{self.seen:.4g}", ""))
+        rows = [(name, *(figure(v, 4) for v in band)) for name, band in shown.items() if band is not None]
+        rows += [(f"predicted here: {name}", *(figure(v, 4) for v in band)) for name, band in self.predicted.items()]
+        rows.insert(1 + len(shown), ("seen in the trial", "", f"{figure(self.seen, 4)}", ""))
         title = f"Cost in {self.steps} steps, mean of {self.stretches} stretches of the trial"
         return Table(("", "lowest", "middle", "highest"), rows, title, "lr")
 

@@ -15,6 +15,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.archive import file_errors
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.tables import Table
+from mpcoffline.core.text import figure
 from mpcoffline.datasets.table.files import load_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learner.learner import OfflineMPCLearner
@@ -133,7 +134,7 @@ class Tuned:
 
 
 def _number(value: Any) -> str:
-    return "?" if value is None else f"{value:.4g}"
+    return "?" if value is None else figure(float(value), 4)
 
 
 def item(text: str) -> str:

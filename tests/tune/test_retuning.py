@@ -94,6 +94,17 @@ def test_a_trial_of_a_changed_plant_is_far_outside_and_nothing_is_recommended(tu
     assert "a folder that tune has made" in command.stderr
 
 
+@pytest.mark.parametrize(
+    "changes", [{"costs": 5}, {"episode_steps": "x"}, {"trials": [{}]}, {"version": 9}, {"options": 1}]
+)
+def test_a_damaged_folder_is_refused_and_stays(copied: Path, changes: dict[str, Any]) -> None:
+    file = copied / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    with pytest.raises(FileFormatError, match=r"run\.json"):
+        retune(copied, LOG)
+    assert not (copied / "1").exists()
+
+
 def calibration(seen: float, low: float, middle: float, high: float) -> Calibration:
     return Calibration(10, 3, seen, {TRIED: (low, middle, high)}, None, 5)
 
