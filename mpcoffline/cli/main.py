@@ -12,7 +12,9 @@ from . import (
     learn as cli_learn,
     own_plants as cli_own_plants,
     run as cli_run,
+    serving as cli_serving,
     tools as cli_tools,
+    tuning as cli_tuning,
 )
 from .common import ErrorGroup, console, progress_to_stderr
 
@@ -47,6 +49,6 @@ def main(
     progress_to_stderr()
 
 
-for commands in (cli_run, cli_own_plants, cli_learn, cli_figures, cli_tools):
+for commands in (cli_run, cli_own_plants, cli_tuning, cli_serving, cli_learn, cli_figures, cli_tools):
     app.add_typer(commands.app)
 app.add_typer(cli_datasets.app, name="datasets")

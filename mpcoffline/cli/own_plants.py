@@ -131,16 +131,7 @@ def check(
 
     Exits with 1 where something is to be mended first.
     """
-    options: dict[str, Any] = {
-        "columns": _pairs("--column", column),
-        "units": _pairs("--unit", unit),
-        "where": _pairs("--where", where),
-        "time": None if not time else time if len(time) > 1 else time[0],
-        "time_format": time_format,
-        "timezone": timezone,
-        "episode": episode,
-        "max_gap": max_gap,
-    }
+    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
     from mpcoffline.plants import load_plant
     from mpcoffline.tune import check_log
 
@@ -155,7 +146,30 @@ def check(
         raise typer.Exit(1)
 
 
-def _pairs(option: str, given: list[str] | None) -> dict[str, str]:
+def read_options(
+    column: list[str] | None,
+    unit: list[str] | None,
+    where: list[str] | None,
+    time: list[str] | None,
+    time_format: str | None,
+    timezone: str | None,
+    episode: str | None,
+    max_gap: float | None,
+) -> dict[str, Any]:
+    """The options of :meth:`mpcoffline.Plant.read` from those of a command."""
+    return {
+        "columns": pairs("--column", column),
+        "units": pairs("--unit", unit),
+        "where": pairs("--where", where),
+        "time": None if not time else time if len(time) > 1 else time[0],
+        "time_format": time_format,
+        "timezone": timezone,
+        "episode": episode,
+        "max_gap": max_gap,
+    }
+
+
+def pairs(option: str, given: list[str] | None) -> dict[str, str]:
     """NAME=VALUE, several of them."""
     found = {}
     for each in given or []:

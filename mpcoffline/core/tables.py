@@ -62,6 +62,20 @@ class Table:
             table.add_row(*(Text(visible(cell)) for cell in row), style=self.styles[k] if self.styles else None)
         return table
 
+    @property
+    def lines(self) -> list[str]:
+        """The table as plain text, a line each, its title first."""
+        rows = [list(map(str, row)) for row in (self.header, *self.rows)]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(self.header))]
+        shown = [
+            "  ".join(
+                cell.rjust(width) if self._is_right(k) else cell.ljust(width)
+                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in rows
+        ]
+        return [*([self.title] if self.title else []), *(f"  {line}" for line in shown)]
+
     def markdown(self, cell: Callable[[str], str] = markdown) -> str:
         """The table in Markdown, its lines ended but for the last.
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.files import hash_of
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.envs import find_plant
 from mpcoffline.estimation import Identification
@@ -206,9 +207,6 @@ def episode_line(table: TransitionTable) -> tuple[int, int, int, int]:
 
 def made_by(learner: OfflineMPCLearner, table: TransitionTable, seed: int) -> tuple[tuple[str, str], ...]:
     """What is needed to make the same report again, and to see whether two are of the same fit."""
-    digest = hashlib.sha256()
-    for column in (table.rows, table.episode_ids, *table.centring):
-        digest.update(np.ascontiguousarray(column).data)
     theta = np.ascontiguousarray(learner.mpc.theta, dtype="<f8")
     how = f"method {type(learner.method).__name__}" if learner.preset is None else f"preset {learner.preset}"
     return (
@@ -216,7 +214,7 @@ def made_by(learner: OfflineMPCLearner, table: TransitionTable, seed: int) -> tu
         ("seed of the fit", str(learner.seed)),
         ("seed of this diagnosis", str(seed)),
         ("SHA-256 of the learned theta", hashlib.sha256(theta.data).hexdigest()),
-        ("SHA-256 of the log", digest.hexdigest()),
+        ("SHA-256 of the log", hash_of(table)),
         ("Python", platform.python_version()),
         *((name, version(name)) for name in _PACKAGES),
     )

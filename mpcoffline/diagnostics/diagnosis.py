@@ -69,6 +69,7 @@ def diagnose(
     n_steps: int | None = None,
     seed: int = 0,
     rules: Sequence[str] = DEFAULT_RULES,
+    today: int | None = None,
 ) -> Report:
     """Diagnoses a fit from the log alone.
 
@@ -90,6 +91,8 @@ def diagnose(
         n_steps: Their length; by default that of the logged ones.
         seed: Seeds models, starts and noise.
         rules: Names of the rules that may withhold a recommendation, of ``mpcoffline.diagnostics.withholding.RULES``.
+        today: How many episodes, the first ones, were made by the controller that runs today; all by default. Others,
+            as of a trial, tell what the plant does, not what runs today.
 
     Returns:
         The report.
@@ -100,6 +103,7 @@ def diagnose(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     counts = {"n_starts": n_starts, "n_steps": n_steps}
+    counts |= {"today": today}
     check_integers(1, **{name: count for name, count in counts.items() if count is not None})
     for name in rules:
         check_known("rule", name, RULES)
@@ -124,12 +128,19 @@ def diagnose(
         n_steps=n_steps,
         seed=seed + _FRESH,
     )
-    clone = Behaviour.of(around.logged, learned.layout, seed)
-    deviations = clone.deviations(around.logged, around.rows, around.n_steps)
+    logs = around.logged
+    own = _of_today(logs, today)
+    clone = Behaviour.of(logs if own.all() else logs.take(np.flatnonzero(own)), learned.layout, seed)
+    deviations = clone.deviations(logs, around.rows, around.n_steps)
+    others = ~own[around.rows]  # of which nobody knows what today's controller would have done beside
+    deviations[others], around.returns[others] = 0.0, np.nan
     trials, loops = _tried(chosen, lambda starts: {**policies, TODAY: clone.replaying(deviations[starts])}, around)
     first, second = loops[FIRST], loops[chosen]
-    today, rows = clone.replaying(deviations[: around.usual]), around.rows[: around.usual]
-    trust = _trust(agreement(around.models, around.cost, around.logged, today, rows, around.n_steps), trials.votes)
+    usual = np.flatnonzero(~others[: around.usual])
+    rows, acting = around.rows[usual], clone.replaying(deviations[usual])
+    trust = None
+    if len(rows):
+        trust = _trust(agreement(around.models, around.cost, logs, acting, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
@@ -195,6 +206,13 @@ def diagnose(
         chosen != FIRST,
     )
     return report.with_notes(notes_on(report, fit))
+
+
+def _of_today(table: TransitionTable, today: int | None) -> NDArray[np.bool_]:
+    """Which rows are of the first episodes, ``(n,)``; all where no number is given, or no row would be left."""
+    ids = np.asarray(table.episode_ids)
+    own = np.ones(len(ids), dtype=bool) if today is None else ids < today
+    return own if own.any() else np.ones(len(ids), dtype=bool)
 
 
 def _tried(

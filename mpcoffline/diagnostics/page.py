@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from mpcoffline.core.tables import Table
 from mpcoffline.core.text import listed, visible
 
 from .background import Names, ParameterLine
@@ -32,13 +34,37 @@ _GROUPS = {"model": "Model", "cost": "Stage cost", "terminal": "Terminal cost", 
 _SHORT = {"recommend": "good", "try with care": "care", "keep MPC_1": "keep"}
 
 
-def page_of(report: Report, *, title: str = "", names: Names | None = None) -> str:
+@dataclass(frozen=True)
+class Section:
+    """A part of a page that is not of the report.
+
+    Attributes:
+        title: Its heading.
+        texts: Its paragraphs.
+        items: What is listed below.
+        tables: Its tables.
+        early: Whether it follows the verdict at once; else it stands with the data.
+    """
+
+    title: str
+    texts: Sequence[str] = ()
+    items: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    early: bool = False
+
+    def numeric(self, table: Table, column: int) -> bool:
+        """Whether a column of a table holds figures."""
+        return table.align[min(column, len(table.align) - 1)] == "r"
+
+
+def page_of(report: Report, *, title: str = "", names: Names | None = None, sections: Sequence[Section] = ()) -> str:
     """A report as a page of HTML.
 
     Args:
         report: The report.
         title: Its heading; the plant's name by default.
         names: Names and units, where they are known better.
+        sections: Further parts.
 
     Raises:
         InvalidArgumentError: For names of another number of columns.
@@ -72,6 +98,7 @@ def page_of(report: Report, *, title: str = "", names: Names | None = None) -> s
         checks=_checks(report),
         noise=_noise(report),
         made_by=() if background is None else background.made_by,
+        sections=sections,
         docs=_DOCS,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from html import escape
 from os import PathLike
@@ -25,7 +26,7 @@ from .differences import TODAY, candidates
 from .figure import Traces, draw
 from .limits import LimitCheck
 from .measures import GoalCheck, LagCheck, RegionError, ValueCheck
-from .page import page_of
+from .page import Section, page_of
 from .stability import TheoremCheck, WeightCheck
 from .verdict import Judgement, Verdict, costs_of
 
@@ -271,7 +272,14 @@ class Report:
         """
         return save_figure(self.plot(), Path(path))
 
-    def html(self, path: str | PathLike[str], *, title: str = "", names: Names | None = None) -> Path:
+    def html(
+        self,
+        path: str | PathLike[str],
+        *,
+        title: str = "",
+        names: Names | None = None,
+        sections: Sequence[Section] = (),
+    ) -> Path:
         """Writes the report as one page of HTML, for a browser and for paper, that loads nothing from elsewhere.
 
         It begins with the verdict and its reasons; then what would change (costs, closed loops from the same starts),
@@ -282,6 +290,7 @@ class Report:
             path: The file; what was there is replaced, its folder made where it is missing.
             title: The heading; by default the name of the plant, where that is known.
             names: Names and units of states, inputs and cost, where they are known better than from the data set.
+            sections: Further parts of the page.
 
         Returns:
             The file.
@@ -290,7 +299,7 @@ class Report:
             InvalidArgumentError: For names of another number of columns.
             StorageError: If it cannot be written.
         """
-        return write_file(path, page_of(self, title=title, names=names))
+        return write_file(path, page_of(self, title=title, names=names, sections=sections))
 
 
 def _as_data(value: Any) -> Any:

@@ -148,7 +148,25 @@ class Candidates(Mapping[str, MPC]):
         return cls(mpcs, chosen, trials)
 
 
-def candidates_of(learner: OfflineMPCLearner, run: Run, table: TransitionTable, bars: Bars) -> Candidates | None:
+def check_also(nominal: MPC, also: Mapping[str, MPC]) -> None:
+    """Refuses further candidates that no other could be compared with.
+
+    Raises:
+        InvalidArgumentError: For the name of one that there is anyhow, or an MPC of another plant.
+    """
+    for name, mpc in also.items():
+        check_name("candidate", name)
+        if name in (FIRST, FULL):
+            raise InvalidArgumentError("also", expected=f"other names than {FIRST} and {FULL}", actual=repr(name))
+        if (mpc.ny, mpc.nu) != (nominal.ny, nominal.nu):
+            sizes = "{} observations and {} inputs"
+            expected, actual = (sizes.format(each.ny, each.nu) for each in (nominal, mpc))
+            raise InvalidArgumentError(f"also: {name}", expected=expected, actual=actual)
+
+
+def candidates_of(
+    learner: OfflineMPCLearner, run: Run, table: TransitionTable, bars: Bars, also: Mapping[str, MPC]
+) -> Candidates | None:
     """What a learner could hand out at the end of a run, and what it does; None where that is the whole fit alone.
 
     Raises:
@@ -156,6 +174,7 @@ def candidates_of(learner: OfflineMPCLearner, run: Run, table: TransitionTable, 
     """
     known, nominal = run.known, learner.nominal_mpc
     between = {} if learner.candidate == FULL else run.method.candidates(known)
+    between = {**between, **also} if between or learner.candidate != "auto" else between
     if learner.candidate == "auto":
         show, variants = partial(bars.show, "choosing on models of the log"), partial(run.method.variants, known)
         return tried(nominal, known, between, table, variants, show, polish=learner.polish) if between else None

@@ -24,7 +24,7 @@ from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.shown import parameter_table
 
-from .candidates import FULL, TRIALS, Candidates, candidates_of
+from .candidates import FULL, TRIALS, Candidates, candidates_of, check_also
 from .checkpoint import Checkpoint, History, history_from_json
 from .findings import findings
 from .presets import PRESETS
@@ -184,6 +184,7 @@ class OfflineMPCLearner:
         callbacks: Sequence[Callback] = (),
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
+        also: Mapping[str, MPC] | None = None,
     ) -> History:
         """Learns, stage by stage: by all presets V_phi, then theta.
 
@@ -202,6 +203,7 @@ class OfflineMPCLearner:
             checkpoint: A file that is written at the end of each epoch. Where it exists, the fit goes on from it and
                 ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
+            also: Further MPCs of this plant by name, as one that runs already: candidates beside what is learned.
 
         Returns:
             ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
@@ -222,6 +224,7 @@ class OfflineMPCLearner:
             callbacks=callbacks,
             checkpoint=checkpoint,
             show_progress=show_progress,
+            also=also,
         ):
             pass
         return self.history
@@ -236,10 +239,12 @@ class OfflineMPCLearner:
         callbacks: Sequence[Callback] = (),
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
+        also: Mapping[str, MPC] | None = None,
     ) -> Iterator[tuple[int, dict[str, float]]]:
         """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
         for name in evaluators or {}:
             check_name("evaluator", name)
+        check_also(self.nominal_mpc, also or {})
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
         method = self.method if n_steps is None else self.method.replaced({"value_n_steps": n_steps})
@@ -273,7 +278,7 @@ class OfflineMPCLearner:
                 if any(_asks_to_end(answer) for answer in answers):
                     break
             if run.learned is not None:
-                self.candidates = candidates_of(self, run, table, bars)
+                self.candidates = candidates_of(self, run, table, bars, also or {})
                 self._policy = None
             self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from mpcoffline.datasets.logs.reading import LoggedTable
+    from mpcoffline.datasets.logs.wanted import Wanted
 
 _WIDE = 100.0  # times and parts of its value that a parameter may become where nothing is said
 
@@ -290,16 +291,22 @@ class Plant:
             StorageError: For a file that cannot be read.
         """
         from mpcoffline.datasets.logs.collecting import Options
+        from mpcoffline.datasets.logs.reading import read_log
+
+        options = Options(columns or {}, units or {}, time, time_format, timezone, episode, where or {}, max_gap)
+        return read_log(log, self.wanted, options)
+
+    @property
+    def wanted(self) -> Wanted:
+        """What a log of it should hold."""
         from mpcoffline.datasets.logs.columns import Quantity
-        from mpcoffline.datasets.logs.reading import Wanted, read_log
+        from mpcoffline.datasets.logs.wanted import Wanted
 
         states, inputs, signals = (
             [Quantity(q.name, q.unit, q.low, q.high) for q in each] for each in (self.states, self.inputs, self.signals)
         )
         previews, periods = [s.preview for s in self.signals], [s.period for s in self.signals]
-        wanted = Wanted(self.dt, states, inputs, signals, previews, periods, self.costs)
-        options = Options(columns or {}, units or {}, time, time_format, timezone, episode, where or {}, max_gap)
-        return read_log(log, wanted, options)
+        return Wanted(self.dt, states, inputs, signals, previews, periods, self.costs)
 
     def env(self, **options: Any) -> gym.Env[Any, Any]:
         """A Gymnasium environment that simulates this plant.

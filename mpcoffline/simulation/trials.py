@@ -237,6 +237,17 @@ class Surroundings:
         other.models, other.disturbances = self.models.some(models), self.disturbances[models]
         return other
 
+    def begun_at(self, starts: Array, signals: Array) -> Surroundings:
+        """The same models and disturbances from other starts, under other signals.
+
+        Args:
+            starts: States of the models, ``(starts, nx)``, as many as there are.
+            signals: One after each step, ``(starts, n_steps, ny - n_states)``.
+        """
+        other = copy.copy(self)
+        other.starts, other.signals = starts, signals
+        return other
+
     def act(self, controllers: Sequence[Controller], starts: slice = slice(None), kept: int = 0) -> list[Episodes]:
         """Closed loops of controllers on all models from all starts; all decisions of one in a step are one batch.
 

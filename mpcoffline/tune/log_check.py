@@ -60,9 +60,10 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
             found.add("problem", each.what, f"{each.why}, {each.count} rows from {each.first} on: is its sensor well?")
     findings = check(mpc, table)
     for finding in findings.findings:
-        found.add("problem", "description and data", str(finding))
-    _coverage(plant, table, found)
-    _goal(plant, mpc, table, found)
+        found.add("problem", "description and data", str(finding), forbids=finding in findings.errors)
+    if (table.ny, table.nu) == (mpc.ny, mpc.nu):
+        _coverage(plant, table, found)
+        _goal(plant, mpc, table, found)
     misread = any(finding.misread for finding in findings.findings)
     if misread:
         text = "what rests on the model (dead time, parameters, noise, predictions) is looked at once that is mended"
@@ -75,7 +76,7 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
             mpc = _dead_time(plant, mpc, table, found, seed)
             found.identification = identify(mpc, table, seed=seed)
         except InvalidDataError as error:
-            found.add("problem", "identification", str(error))
+            found.add("problem", "identification", str(error), forbids=True)
             return found
     parameters(plant, mpc, table, found)
     _noise(plant, found)

@@ -22,11 +22,13 @@ class Remark:
         kind: ``"problem"``: mend it first; ``"advice"``: better with it; ``"good"``.
         about: What it is about: a section of the page.
         text: The sentence.
+        forbids: Whether nothing can be fitted before it is mended.
     """
 
     kind: Kind
     about: str
     text: str
+    forbids: bool = False
 
     def __str__(self) -> str:
         return self.text
@@ -52,9 +54,9 @@ class LogCheck:
     delays: DelaySearch | None = None
     experiments: dict[str, Experiment | None] = field(default_factory=dict)
 
-    def add(self, kind: Kind, about: str, text: str) -> None:
+    def add(self, kind: Kind, about: str, text: str, *, forbids: bool = False) -> None:
         """Enters a remark."""
-        self.remarks.append(Remark(kind, about, text))
+        self.remarks.append(Remark(kind, about, text, forbids))
 
     def sort(self) -> None:
         """Puts problems first, then advice."""
@@ -87,15 +89,5 @@ class LogCheck:
             if chosen:
                 lines += [f"{title}:", *(f"* {each.about}: {each.text}" for each in chosen), ""]
         for table in self.tables:
-            lines += [table.title, *(_plain(table)), ""]
+            lines += [*table.lines, ""]
         return "\n".join(lines).rstrip()
-
-
-def _plain(table: Table) -> list[str]:
-    rows = [list(table.header), *map(list, table.rows)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(table.header))]
-    right = [(table.align[min(i, len(table.align) - 1)] == "r") for i in range(len(widths))]
-    return [
-        "  ".join(c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True)).rstrip()
-        for row in rows
-    ]

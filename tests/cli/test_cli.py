@@ -50,7 +50,8 @@ def refused(*arguments: str | Path) -> str:
 
 
 COMMANDS = [
-    "run", "reproduce", "collect", "new", "check", "learn", "evaluate", "diagnose", "plot", "export", "clean", "doctor",
+    "run", "reproduce", "collect", "new", "check", "tune", "retune", "serve", "learn", "evaluate", "diagnose", "plot",
+    "export", "clean", "doctor",
 ]  # fmt: skip
 DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
 
@@ -67,7 +68,7 @@ def test_every_command_has_help_with_examples(command: str) -> None:
     assert result.exit_code == 0
     assert "Usage: " in plain(result)
     assert f"mpcoffline {command}" in re.split("Examples?:", plain(result))[1]
-    if command in ("run", "reproduce", "collect", "learn", "evaluate"):
+    if command in ("run", "reproduce", "collect", "tune", "learn", "evaluate"):
         assert "--seed" in plain(result)
 
 

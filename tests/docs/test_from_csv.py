@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from tank_logs import simulated, text
 from typer.testing import CliRunner
 
+import mpcoffline.tune as tune_module
 from mpcoffline.cli import app
 
 pytest.importorskip("polars")
@@ -30,8 +33,21 @@ def test_its_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     names: dict[str, Any] = {"learner": Learner()}
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 6
+    given: list[tuple[Any, ...]] = []  # both have tests of their own, of a minute
+
+    def stand_in(*arguments: Any) -> Any:
+        given.append(arguments)
+        band = SimpleNamespace(inside=True, off=0.3)
+        return SimpleNamespace(policy="policy.zip", calibration=band)
+
+    for name in ("tune", "retune"):
+        inspect.signature(getattr(tune_module, name)).bind(*(["given"] * (3 if name == "tune" else 2)))
+        monkeypatch.setattr(tune_module, name, stand_in)
     for block in blocks:
         exec(block, names)
+    assert given == [(names["plant"], names["table"], "tuned"), ("tuned", "trial.csv")]
+    assert names["stats"].periods + names["stats"].skipped == 5
+    assert len(Path("served.csv").read_text().splitlines()) == 1 + names["stats"].periods
     assert names["learner"].rows == 59
     assert names["env"].spec.id == "plants/TwoTanks-v0"

@@ -11,7 +11,7 @@ import pytest
 from lq_episodes import episodes
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner
-from mpcoffline.core.errors import FileFormatError, UnknownIdError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST
@@ -161,3 +161,14 @@ def test_a_file_whose_candidates_do_not_fit_is_refused(
     learner.save(tmp_path / "l.zip")
     with pytest.raises(FileFormatError, match="candidates"):
         OfflineMPCLearner.load(tmp_path / "l.zip")
+
+
+def test_further_candidates_take_part() -> None:
+    best = lq_plant.make_mpc((lq_plant.A, lq_plant.B))
+    learner = OfflineMPCLearner(WRONG, **QUICK)
+    learner.fit(LOG, show_progress=False, also={"running": best})
+    assert learner.candidates is not None
+    assert learner.candidates["running"] is best
+    for also, message in (({FULL: best}, "other names than"), ({"a\n": best}, "candidate")):
+        with pytest.raises(InvalidArgumentError, match=message):
+            learner.fit(LOG, also=also)

@@ -211,7 +211,10 @@ def _days(parts: _Parts, dt: float, report: LogReport) -> None:
 
 
 def _clock(source: Source, options: Options, quantities: set[int]) -> tuple[list[int], Clock | None]:
-    """The columns of the time, and what reads them; none where there is no such column but a quantity's."""
+    """The columns of the time, and what reads them; none where there is no such column.
+
+    Without an option it is no column that a quantity has, as T of a temperature.
+    """
     if options.time is not None:
         names = [options.time] if isinstance(options.time, str) else list(options.time)
         found_ones = [place_of(source, name, name) for name in names]

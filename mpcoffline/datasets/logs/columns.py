@@ -96,12 +96,15 @@ def place_of(source: Source, name: str, given: str | None) -> tuple[int, str | N
         listed += f" and {len(source.header) - 30} more"
     if chosen:
         actual = ", ".join(repr(source.header[i]) for i in chosen)
-        hint = f"columns={{{name!r}: ...}} says which."
+        hint = f"columns={{{name!r}: ...}} says which (--column {name}=...)."
         raise InvalidDataError(where, expected="one column of that name", actual=f"{len(chosen)}: {actual}", hint=hint)
     near = difflib.get_close_matches(wanted, source.header, n=1, cutoff=0.4)
     hint = f"Is it {near[0][:_SHOWN]!r}? " if near else ""
     raise InvalidDataError(
-        where, expected=f"one among {listed}", actual="none", hint=f"{hint}columns={{{name!r}: ...}} says which."
+        where,
+        expected=f"one among {listed}",
+        actual="none",
+        hint=f"{hint}columns={{{name!r}: ...}} says which (--column {name}=...).",
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +20,7 @@ from .collecting import Options, Rows, collected
 from .columns import Quantity
 from .report import LogReport
 from .sampling import Series, averaged, between, free_of, grid, held, phase_of
+from .wanted import Wanted
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -31,38 +30,6 @@ _CLIPPED = 0.01  # of an input's range, by which it may lie beyond its bounds
 _MOST_BEYOND = 0.2  # share of rows
 _UNIT = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
 
-#: The cost of steps ``(n,)`` from states, inputs, present signals and the inputs of the step before, ``(n, ...)`` each.
-Cost = Callable[[Array, Array, Array, Array], Array]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a log should hold.
-
-    Attributes:
-        dt: Control interval in s.
-        states: What is measured.
-        inputs: What was applied.
-        signals: What came from outside.
-        previews: How many steps ahead the observation holds each signal, beside the present one.
-        periods: Of signals that are clocks, the control intervals of a turn; None of others.
-        cost: What a step costs.
-    """
-
-    dt: float
-    states: Sequence[Quantity]
-    inputs: Sequence[Quantity]
-    signals: Sequence[Quantity]
-    previews: Sequence[int]
-    periods: Sequence[float | None]
-    cost: Cost
-
-    @property
-    def logged(self) -> list[Quantity]:
-        """What has a column; clocks are computed."""
-        outside = [s for s, period in zip(self.signals, self.periods, strict=True) if period is None]
-        return [*self.states, *self.inputs, *outside]
-
 
 class LoggedTable(TransitionTable):
     """A table of transitions that remembers how it was read.
@@ -71,9 +38,13 @@ class LoggedTable(TransitionTable):
         report: What became of the log.
         action_bounds: Bounds of the inputs, ``(nu,)`` each.
         names: Names and units of its columns, observations first.
+        options: As what it was read.
+        header: Names of the first log's columns.
     """
 
     report: LogReport
+    options: Options
+    header: list[str]
     action_bounds: tuple[Array, Array]
     names: tuple[str, ...]
 
@@ -134,7 +105,9 @@ def read_log(sources: Any, wanted: Wanted, options: Options) -> LoggedTable:
     name = ", ".join(Path(each).name if isinstance(each, str | Path) else "frame" for each in every[:3])
     max_gap = _gap(name, rows, wanted.dt, options.max_gap, report)
     _mend(rows, wanted, report)
-    return _sampled(name, rows, wanted, max_gap, report)
+    table = _sampled(name, rows, wanted, max_gap, report)
+    table.options, table.header = options, list(rows.files[0][1].header)
+    return table
 
 
 def _gap(name: str, rows: Rows, dt: float, given: float | None, report: LogReport) -> float:

@@ -1,0 +1,143 @@
+"""The commands that end with a controller of one's own: ``mpcoffline tune`` and ``mpcoffline retune``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from mpcoffline.core.errors import visible
+
+from .common import Json, Preset, Seed, console, examples, messages, print_json
+from .own_plants import (
+    Columns,
+    Episode,
+    Logs,
+    MaxGap,
+    PlantFile,
+    Time,
+    TimeFormat,
+    Timezone,
+    Units,
+    Where,
+    read_options,
+)
+
+if TYPE_CHECKING:
+    from mpcoffline.tune import Tuned
+
+app = typer.Typer()
+
+
+@app.command(
+    epilog=examples(
+        "mpcoffline tune two_tank.py log.csv --out tuned/",
+        "mpcoffline tune two_tank.py log.csv --column h1=LI-101.PV --where mode=AUTO --preset best",
+    )
+)
+def tune(
+    file: PlantFile,
+    logs: Logs,
+    out: Annotated[Path, typer.Option(help="Folder for all that is made.", file_okay=False)] = Path("tuned"),
+    column: Columns = None,
+    unit: Units = None,
+    where: Where = None,
+    time: Time = None,
+    time_format: TimeFormat = None,
+    timezone: Timezone = None,
+    episode: Episode = None,
+    max_gap: MaxGap = None,
+    preset: Annotated[
+        Preset,
+        typer.Option(
+            help="default: what most users should get; fast: the shortest horizon; best: the longest; paper: the "
+            "published recipe."
+        ),
+    ] = Preset.default,
+    polish: Annotated[
+        bool,
+        typer.Option(
+            "--polish",
+            help="Move the best candidate's weights, too, by what closed loops cost; needs mpcoffline[polish].",
+        ),
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Tune a controller from a log of your plant: check, fit, verdict, report and C code, in one folder.
+
+    The folder receives report.html, policy.zip, learner.zip, controller/ (C99), log.zip, run.json. Ctrl-C loses nothing
+    that was finished: the same command goes on from there. A changed log, plant file or option starts anew; a result
+    that was in the folder stays in a numbered one inside.
+
+    Where the verdict is "keep MPC_1", policy.zip is MPC_1, the controller of the plant file as it is.
+    """
+    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
+    _tell(f"Reading {', '.join(log.name for log in logs)}")
+    from mpcoffline.plants import load_plant
+    from mpcoffline.tune import tune as tuned
+
+    plant = load_plant(file)
+    table = plant.read(logs, **options)
+    _tell(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
+    try:
+        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=_tell)
+    except KeyboardInterrupt:
+        _tell("What was finished is kept: the same command goes on from there.")
+        raise
+    _show(result, as_json)
+
+
+@app.command(epilog=examples("mpcoffline retune tuned/ trial.csv", "mpcoffline retune tuned/ a.csv b.csv --json"))
+def retune(
+    folder: Annotated[Path, typer.Argument(metavar="TUNED", help="The folder of tune.", exists=True, file_okay=False)],
+    trial: Logs,
+    column: Columns = None,
+    unit: Units = None,
+    where: Where = None,
+    time: Time = None,
+    time_format: TimeFormat = None,
+    timezone: Timezone = None,
+    episode: Episode = None,
+    max_gap: MaxGap = None,
+    as_json: Json = False,
+) -> None:
+    """Learn from a trial, too, and say whether it cost what was predicted.
+
+    Reads the log of a trial with the tuned controller: one of `mpcoffline serve`, or one like that given to tune, whose
+    options hold for it, too. Simulates the trial on the models of the log before it, and compares; then fits again with
+    both logs. The folder is replaced as a whole; what it held is kept in a numbered one inside.
+    """
+    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
+    _tell(f"Reading {', '.join(log.name for log in trial)}")
+    from mpcoffline.tune import retune as retuned
+    from mpcoffline.tune.retuning import trial_lines
+
+    try:
+        result = retuned(folder, trial, read=options, tell=_tell)
+    except KeyboardInterrupt:
+        _tell("What was finished is kept: the same command goes on from there.")
+        raise
+    if not as_json:
+        far = result.calibration is not None and result.calibration.far
+        head, *rest = trial_lines(result.tuned.document)
+        console.print(Text(visible(head), style="bold red" if far else "bold"), soft_wrap=True)
+        console.print(Text(visible("\n".join(rest)) + "\n"), soft_wrap=True)
+    _show(result.tuned, as_json)
+
+
+def _tell(text: str) -> None:
+    messages.print(Text(visible(text), style="dim" if text.startswith("Reading") else ""))
+
+
+def _show(result: Tuned, as_json: bool) -> None:
+    """Verdict, files and what to do next; the verdict stands out."""
+    if as_json:
+        print_json({"folder": result.folder, "again": result.again, "former": result.former} | dict(result.document))
+        return
+    colours = {"recommend": "bold green", "try with care": "bold yellow"}
+    head, *rest = visible(str(result)).split("\n")
+    console.print(Text(head, style=colours.get(result.verdict, "bold red")))
+    console.print(Text("\n".join(rest)), soft_wrap=True)

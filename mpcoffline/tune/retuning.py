@@ -1,0 +1,192 @@
+"""``retune``: learns from a trial, too, and says whether it went as predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+from mpcoffline.core.archive import file_errors
+from mpcoffline.core.documents import read_json
+from mpcoffline.datasets.logs.collecting import Options
+from mpcoffline.datasets.logs.reading import LoggedTable, read_log
+from mpcoffline.datasets.logs.sources import opened
+from mpcoffline.datasets.logs.wanted import Wanted
+from mpcoffline.datasets.table.files import hash_of
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.diagnostics.page import Section
+from mpcoffline.simulation.choice import FIRST
+
+from .folder import PLANT, RUN, Workplace, identity_of, read_run
+from .making import RUNNING, Order, Tell, made
+from .trial import Band, Calibration, compared
+from .tuned import Tuned, item
+
+_DOUBT = (
+    "The last trial lay far outside what was predicted for it: models of both logs together describe neither surely."
+    " Nothing is recommended before a trial has gone as predicted."
+)
+
+
+@dataclass(frozen=True)
+class Retuned:
+    """What a trial has changed.
+
+    Attributes:
+        tuned: What the folder holds now.
+        calibration: Predicted and seen cost of the trial; None where the folder held it already.
+    """
+
+    tuned: Tuned
+    calibration: Calibration | None
+
+    def __str__(self) -> str:
+        """The trial, then the new verdict."""
+        return "\n".join([*trial_lines(self.tuned.document), "", str(self.tuned)])
+
+
+def retune(
+    folder: str | PathLike[str],
+    trial: Any,
+    *,
+    read: Mapping[str, Any] | None = None,
+    tell: Tell | None = None,
+    show_progress: bool = True,
+) -> Retuned:
+    """Compares a trial with what was predicted for it, and learns from both logs.
+
+    The plant file is not run again: what reads logs and what a step costs stands in the folder. The controller of the
+    trial is a candidate beside what is learned now, so that it is handed out again where nothing is better. The folder
+    is replaced as a whole; what it held is kept in a numbered folder inside. A trial that it has learned from already
+    changes nothing.
+
+    Example:
+        >>> after = retune("tuned", "trial.csv")
+        >>> print(after)
+        >>> after.calibration.inside
+
+    Args:
+        folder: What :func:`tune` made.
+        trial: The log of the trial: a file, a frame, or several.
+        read: How it is read, as :meth:`mpcoffline.Plant.read` takes it; a log with the header of the first one is read
+            as that was, any other by the plant's names.
+        tell: Is told, in a sentence, what is done now.
+        show_progress: Whether the fit draws a progress bar.
+
+    Raises:
+        FileFormatError: If the folder is none of ``tune``, or damaged.
+        InvalidDataError: If the trial cannot be understood, or contradicts the description.
+    """
+    tell = tell or (lambda _: None)
+    before = Tuned.load(folder)
+    reader, name = _reader(before)
+    table = read_log(trial, reader, _options(before, trial, read))
+    tell(f"{len(table):,} control intervals of {reader.dt:g} s, {table.n_episodes} without a gap")
+    sha, (options, expected, today, history) = hash_of(table), _of_before(before)
+    if sha in [each["sha256"] for each in history]:
+        tell("This trial has been learned from already")
+        return Retuned(Tuned(before.folder, before.document, again=True), None)
+    place = Workplace(before.folder, identity_of(before=before.document["identity"], trial=sha))
+    if place.begin():
+        tell(f"Going on with {place.path}")
+    learner, log, running = before.learner, before.table, before.policy.mpc
+    today = log.n_episodes if today is None else today
+
+    def tried() -> dict[str, Any]:
+        tell("Comparing the trial with what was predicted")
+        found = compared(learner, running, log, table, expected=expected, today=today, seed=options["seed"])
+        return found.to_json()
+
+    calibration = Calibration.from_json(place.once("trial", tried))
+    history.append({"sha256": sha, "rows": len(table), "controller": before.document["policy"]} | calibration.to_json())
+    both = TransitionTable.concat([log, table])
+    also = {} if before.document["policy"] == FIRST else {RUNNING: running}
+    sections = [_section(calibration, history), _read_section(table)]
+    reader_json, doubt = _reader_json(before), _DOUBT if calibration.far else ""
+    order = Order(name, reader_json, learner.nominal_mpc, both, options, also, sections, today, doubt)
+    document = made(order, place, tell, show_progress=show_progress)
+    kept = {key: before.document[key] for key in ("check", "read") if key in before.document}
+    document |= kept | {"trials": history, "today": today}
+    former = place.finish(document)
+    return Retuned(Tuned(before.folder, read_run(before.folder), former=former), calibration)
+
+
+def _reader_json(before: Tuned) -> dict[str, Any]:
+    """What reads logs, as the folder holds it."""
+    return dict(read_json(before.folder / PLANT))
+
+
+def _reader(before: Tuned) -> tuple[Wanted, str]:
+    path = before.folder / PLANT
+    with file_errors(path):
+        data = _reader_json(before)
+        return Wanted.from_json(data), str(data["name"])
+
+
+def _options(before: Tuned, trial: Any, read: Mapping[str, Any] | None) -> Options:
+    """As the first log was read, where the header is the same; else as is said, or by the plant's names."""
+    given = {name: value for name, value in (read or {}).items() if value}
+    stored = before.document.get("read")
+    if given or not stored:
+        return Options(**given)
+    first = trial[0] if isinstance(trial, list | tuple) and trial else trial
+    with opened(first) as source:
+        alike = list(source.header) == stored["header"]
+    if not alike:
+        return Options()
+    with file_errors(before.folder / RUN):
+        return Options(**stored["options"])
+
+
+def _of_before(before: Tuned) -> tuple[dict[str, Any], tuple[Band, int], int | None, list[dict[str, Any]]]:
+    """Options, expected cost and in how many steps, how many episodes are today's controller's, trials so far.
+
+    Raises:
+        FileFormatError: If the folder says something else.
+    """
+    with file_errors(before.folder / RUN):
+        document = before.document
+        options, today, history = dict(document["options"]), document.get("today"), list(document.get("trials", []))
+        _ = options["seed"], [each["sha256"] for each in history], [each["off"] for each in history]
+        cost = document["costs"].get(document["policy"], {})
+        low, middle, high = (
+            float("nan") if cost.get(end) is None else float(cost[end]) for end in ("lowest", "expected", "highest")
+        )
+        steps = int(document["episode_steps"])
+        return options, ((low, middle, high), steps), None if today is None else int(today), history
+
+
+def _section(calibration: Calibration, history: list[dict[str, Any]]) -> Section:
+    """The trial on the page."""
+    head, *rest = calibration.sentences
+    return Section(
+        "The trial: predicted and seen", (head,), [*rest, *_record(history)], [calibration.table], early=True
+    )
+
+
+def _read_section(table: LoggedTable) -> Section:
+    head, *_ = str(table.report).splitlines()
+    tables = [table.report.table] if table.report.left_out else []
+    return Section("What was read of the trial", (head,), table.report.notes, tables)
+
+
+def _record(history: list[dict[str, Any]]) -> list[str]:
+    """How the predictions have done so far."""
+    told = [each for each in history if each["off"] is not None]
+    if len(told) < 2:
+        return []
+    inside = sum(bool(each["inside"]) for each in told)
+    return [f"Of {len(told)} trials so far, {inside} cost what was predicted for them, within the band."]
+
+
+def trial_lines(document: Mapping[str, Any]) -> list[str]:
+    """What a folder says of its last trial: what came of it, then the figures.
+
+    Raises:
+        FileFormatError: If it says something else.
+    """
+    with file_errors(RUN):
+        last = document["trials"][-1]
+        found = Calibration.from_json(last)
+        return [item(text) for text in found.sentences] + found.table.lines
