@@ -145,7 +145,7 @@ def diagnose(
         choice=choice,
         rules=tuple(rules),
     )
-    limits = limit_checks(nominal, table, first, second) if nominal.constraints is not None else ()
+    limits = limit_checks(nominal, table, first, second, learned) if nominal.constraints is not None else ()
     if chosen != FIRST:
         judgement = with_limits(judgement, limits)
     reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one

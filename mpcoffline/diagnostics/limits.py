@@ -30,7 +30,7 @@ class LimitCheck:
 
     Attributes:
         name: Of the constraint.
-        kind: ``"hard"``, or its prices.
+        kind: ``"hard"``, or its prices; and those that the proposal has, where they are others.
         shares: Of the steps of the log, of MPC_1's and of the proposal's that violate it.
         largest: The largest violation of each, 0 for none, in the unit of the element of h that has it.
         worse: Whether the proposal violates it in more steps than MPC_1, beyond two standard errors.
@@ -43,7 +43,9 @@ class LimitCheck:
     worse: bool
 
 
-def limit_checks(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Episodes) -> tuple[LimitCheck, ...]:
+def limit_checks(
+    mpc: MPC, table: TransitionTable, first: Episodes, proposal: Episodes, learned: MPC | None = None
+) -> tuple[LimitCheck, ...]:
     """Counts violations.
 
     Args:
@@ -51,7 +53,9 @@ def limit_checks(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Ep
         table: The log, in the MPC's states.
         first: What MPC_1 does.
         proposal: What the controller does that is judged.
+        learned: The MPC that it is, of which hard limits may have become soft.
     """
+    now = {} if learned is None else {name: soft for name, soft, _ in _limits(learned)}
     columns = table.values()
     log = columns.observations[None], np.asarray(columns.actions, dtype=np.float64)[None]
     runs = [log, *((each.states[:, :-1], each.actions) for each in (first, proposal))]
@@ -66,7 +70,8 @@ def limit_checks(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Ep
         error = more.std() / np.sqrt(len(more))
         largest = tuple(_largest(h, moved) for h in elements)
         worse = bool(more.mean() > max(_SURE * error, _LEAST))
-        found.append(LimitCheck(name, _kind(soft), _three(shares), _three(largest), worse))
+        kind = _kind(soft) if soft == now.get(name, soft) else f"{_kind(soft)}, handed out with {_kind(now[name])}"
+        found.append(LimitCheck(name, kind, _three(shares), _three(largest), worse))
     return tuple(found)
 
 

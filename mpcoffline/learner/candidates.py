@@ -33,6 +33,10 @@ TRIALS = "trials/"  # in front of the names of their arrays in a file
 logger = logging.getLogger(__name__)
 
 
+def _as_it_is(mpc: MPC) -> MPC:
+    return mpc
+
+
 @dataclass(frozen=True)
 class Candidates(Mapping[str, MPC]):
     """The MPCs that were tried, by name, and how they did.
@@ -152,12 +156,18 @@ def candidates_of(learner: OfflineMPCLearner, run: Run, table: TransitionTable, 
     Raises:
         UnknownIdError: If it was asked for a candidate that there is none of.
     """
-    known, nominal = run.known, learner.nominal_mpc
+    known, nominal, soft = run.known, learner.nominal_mpc, learner.softening
     between = {} if learner.candidate == FULL else run.method.candidates(known)
     if learner.candidate == "auto":
         show, variants = partial(bars.show, "choosing on models of the log"), partial(run.method.variants, known)
-        return tried(nominal, known, between, table, variants, show, polish=learner.polish) if between else None
-    found = Candidates({FIRST: nominal, **between, FULL: known.mpc}, learner.candidate)
+        ready = _as_it_is if soft is None else soft
+        return (
+            tried(nominal, known, between, table, variants, show, polish=learner.polish, ready=ready)
+            if between
+            else None
+        )
+    mpcs = {FIRST: nominal, **between, FULL: known.mpc}
+    found = Candidates(mpcs if soft is None else {name: soft(mpc) for name, mpc in mpcs.items()}, learner.candidate)
     _ = found.mpc  # refuses a name that is none of them
     return None if learner.candidate == FULL else found
 
@@ -171,6 +181,7 @@ def tried(
     tell: Callable[[int, int, str], None],
     *,
     polish: bool = False,
+    ready: Callable[[MPC], MPC] = _as_it_is,
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -182,11 +193,12 @@ def tried(
         variants: Of good ones.
         tell: Is told how many starts of how many are done, and what is tried.
         polish: Whether the best one's weights are moved by what closed loops cost.
+        ready: What becomes of each before it is tried.
     """
-    mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
+    mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    slow = are_slow(quick_policy(mpc) for mpc in (nominal, known.mpc))
+    slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
     around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
     if polish:

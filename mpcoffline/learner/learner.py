@@ -12,9 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
 from mpcoffline.core.checks import check_integers, check_known
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -22,11 +21,13 @@ from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 
-from .candidates import FULL, TRIALS, Candidates, candidates_of
-from .checkpoint import Checkpoint, History, history_from_json
+from .candidates import Candidates, candidates_of
+from .checkpoint import Checkpoint, History
+from .files import read_learner, write_learner
 from .findings import findings
 from .presets import PRESETS
 from .run import Run
+from .softening import Soften, Softening, check_soften, softening_found
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -75,6 +76,10 @@ class OfflineMPCLearner:
             takes that one and tries nothing. The paper's preset has no others than the whole fit.
         polish: Whether weights of the best candidate are moved, too, by what closed loops on models of the log cost
             (``mpcoffline.simulation.polishing``); needs ``pip install "mpcoffline[polish]"``.
+        soften: ``"auto"`` puts exact penalties in place of the hard limits of all candidates and of what is handed out,
+            at prices from MPC_1's multipliers in states of the log (:func:`mpcoffline.solvers.softened`): where a
+            limit cannot be kept, it is violated as little as it must be. ``findings`` and report say which, and how
+            dear. None, the default, leaves hard limits hard.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
@@ -95,6 +100,7 @@ class OfflineMPCLearner:
         preset: The name of the preset; None where a method was given.
         candidate: As given.
         polish: As given.
+        soften: As given.
         candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
             where the method knows of none but the whole fit.
     """
@@ -108,6 +114,7 @@ class OfflineMPCLearner:
         *,
         candidate: str = "auto",
         polish: bool = False,
+        soften: Soften | None = None,
         method: str | Method | None = None,
         value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
@@ -135,6 +142,8 @@ class OfflineMPCLearner:
         self.method = method.replaced(options)
         self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
         self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
+        self.soften = check_soften(soften)
+        self.softening: Softening | None = None
         self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
@@ -164,7 +173,8 @@ class OfflineMPCLearner:
         if not isinstance(self._mpc, MPC):
             return ()
         chosen = () if self.candidates is None else (self.candidates.finding,)
-        return (*findings(self.nominal_mpc, self._mpc, self.result), *chosen)
+        soft = softening_found(self.nominal_mpc, self._mpc)
+        return (*findings(self.nominal_mpc, self._mpc, self.result), *soft, *chosen)
 
     def fit(
         self,
@@ -241,6 +251,7 @@ class OfflineMPCLearner:
         for finding in report.warnings:
             logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
+        self.softening = Softening.of(self.nominal_mpc, table, self.seed) if self.soften else None
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
         history: History = [] if saved is None else saved.resume(run)
@@ -250,7 +261,7 @@ class OfflineMPCLearner:
                     ending.callback(end)
             for epoch in run.epochs(n_steps_per_epoch):
                 self.value_function, self.result = run.value_function, run.result
-                self._mpc, self._policy, self._observation_space = run.learned, None, observation_space
+                self._mpc, self._policy, self._observation_space = self._ready(run), None, observation_space
                 metrics = dict(epoch.metrics)
                 if run.learned is not None:
                     metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
@@ -282,6 +293,11 @@ class OfflineMPCLearner:
                 "learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset)."
             )
         return found
+
+    def _ready(self, run: Run) -> Callable[[], MPC] | None:
+        """How to find the MPC that a run would hand out now; None before the last stage that takes steps."""
+        learned, soft = run.learned, self.softening
+        return learned if learned is None or soft is None else lambda: soft(learned())
 
     def _found(self) -> MPC | None:
         """The MPC; while fitting, its cost and its terminal cost take some seconds, once an epoch."""
@@ -321,28 +337,7 @@ class OfflineMPCLearner:
                 registered; nothing is written then.
             StorageError: If it cannot be written.
         """
-        space = self._observation_space
-        document = {
-            "nominal": self.nominal_mpc.to_json(),
-            "learned": None if self._mpc is None else self.mpc.to_json(),
-            "learn": self.learn,
-            "preset": self.preset,
-            "method": self.method.name,
-            "options": self.method.to_json(),
-            "value_given": self._given_value_function is not None,
-            "seed": self.seed,
-            "device": self.device,
-            "history": self.history,
-            "result": None if self.result is None else self.result.to_json(),
-            "candidate": self.candidate,
-            "polish": self.polish,
-            "candidates": None if self.candidates is None else self.candidates.to_json(),
-            "observation_space": None if space is None else box_to_json(space),
-        }
-        arrays = {} if self.value_function is None else self.value_function.to_arrays()
-        if self.candidates is not None:
-            arrays |= self.candidates.to_arrays()
-        write_archive(path, "learner", document, arrays)
+        write_learner(self, path)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> OfflineMPCLearner:
@@ -352,34 +347,7 @@ class OfflineMPCLearner:
             FileFormatError: If the file is damaged, foreign, of another version, or of a learning method that is not
                 known here.
         """
-        document, arrays = read_archive(path, "learner")
-        method = METHODS.of_file(document.get("method"), str(path))
-        with file_errors(path):
-            nominal = MPC.from_json(document["nominal"])
-            how = method.from_json(document["options"])
-            learner = cls(nominal, document["learn"], seed=document["seed"], method=how, device=document["device"])
-            if document["preset"] is not None:
-                learner.preset = check_name("preset", document["preset"], error=FileFormatError)
-            learner.history = history_from_json(document["history"])
-            if document["learned"] is not None:
-                learner._mpc = MPC.from_json(document["learned"])
-            learner.candidate = check_name("candidate", document["candidate"], error=FileFormatError)
-            learner.polish = document["polish"] is True
-            if document["candidates"] is not None:
-                learner.candidates = Candidates.from_files(document["candidates"], arrays)
-            if document["result"] is not None:
-                whole = learner.mpc if learner.candidates is None else learner.candidates[FULL]
-                learner.result = FitResult.from_json(document["result"], whole.theta)
-            if document["observation_space"] is not None:
-                learner._observation_space = box_from_json(document["observation_space"])
-            arrays = {name: array for name, array in arrays.items() if not name.startswith(TRIALS)}
-            if arrays:
-                learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
-                if document["value_given"]:
-                    learner._given_value_function = learner.value_function
-                if learner.value_function.ny not in (nominal.nx, (learner.mpc if document["learned"] else nominal).nx):
-                    raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
-        return learner
+        return read_learner(cls, path)
 
 
 def _asks_to_end(answer: Any) -> bool:
