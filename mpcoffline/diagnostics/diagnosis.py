@@ -129,8 +129,10 @@ def diagnose(
     trials, loops = _tried(chosen, lambda starts: {**policies, TODAY: clone.replaying(deviations[starts])}, around)
     first, second = loops[FIRST], loops[chosen]
     today, rows = clone.replaying(deviations[: around.usual]), around.rows[: around.usual]
-    trust = _trust(agreement(around.models, around.cost, table, today, rows, around.n_steps), trials.votes)
+    whole = table if around.cost.limits is None else around.cost.limits.whole(table)
+    trust = _trust(agreement(around.models, around.cost, whole, today, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
+    plain, priced = (clean, clean) if cost.limits is None else (cost.limits.without(clean), cost.limits.whole(clean))
     shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, table, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
@@ -155,8 +157,8 @@ def diagnose(
         choice=choice,
         notes=(),
         cost_r2=cost.r2,
-        value=value_check(learner.value_function, clean, learned.discount),
-        fit=fit_errors(nominal, learned, learner.value_function, clean, learner.result),
+        value=value_check(learner.value_function, priced, learned.discount),
+        fit=fit_errors(nominal, learned, learner.value_function, plain, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second),
         weights=weight_checks(nominal, learned, clean),
@@ -172,7 +174,7 @@ def diagnose(
         traces=Traces(
             first.states[..., : learned.layout.n_states],
             second.states[..., : learned.layout.n_states],
-            np.stack(returns_of(learner.value_function, clean, learned.discount)),
+            np.stack(returns_of(learner.value_function, priced, learned.discount)),
             reference,
         ),
         trust=trust,
@@ -190,7 +192,7 @@ def diagnose(
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
     fit = Fit(
         learner.method.options.get("init") == "identified",
-        learner.learn == "cost+model",
+        learner.learn != "cost",
         not cost_kept,
         chosen != FIRST,
     )

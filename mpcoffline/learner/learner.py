@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -32,7 +32,7 @@ from .softening import Soften, Softening, check_soften, softening_found
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-Learn = Literal["cost", "cost+model"]
+Learn = Literal["cost", "cost+model", "cost+model+constraints"]
 #: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
 Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
 #: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
@@ -41,7 +41,7 @@ Callback = Callable[["OfflineMPCLearner", int, int], Any]
 
 logger = logging.getLogger(__name__)
 
-_GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
+_GROUPS: dict[str, tuple[str, ...]] = {name: tuple(name.split("+")) for name in get_args(Learn)}
 
 
 class OfflineMPCLearner:
@@ -65,7 +65,8 @@ class OfflineMPCLearner:
 
     Args:
         mpc: MPC_1: the nominal MPC. It is never changed.
-        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3). A dead time
+        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3),
+            ``"cost+model+constraints"`` besides parameters that soft limits alone depend on, as back-offs. A dead time
             that the model does not state (``delay=None``) is taken from the log in either case.
         preset: Name of a learning method with options in ``mpcoffline.learner.PRESETS``: ``"paper"`` is the published
             recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
@@ -122,7 +123,7 @@ class OfflineMPCLearner:
         **options: Any,
     ) -> None:
         if not isinstance(learn, str) or learn not in _GROUPS:
-            raise InvalidArgumentError("learn", expected="'cost' or 'cost+model'", actual=repr(learn))
+            raise InvalidArgumentError("learn", expected=" or ".join(map(repr, _GROUPS)), actual=repr(learn))
         check_known("preset", preset, PRESETS)
         if method is not None and preset != "default":
             expected = "none beside a method: a preset names its own"
