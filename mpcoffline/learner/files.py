@@ -37,6 +37,7 @@ def write_learner(learner: OfflineMPCLearner, path: str | PathLike[str]) -> None
         "candidate": learner.candidate,
         "polish": learner.polish,
         "soften": learner.soften,
+        "keep_limits": learner.keep_limits,
         "candidates": None if learner.candidates is None else learner.candidates.to_json(),
         "observation_space": None if space is None else box_to_json(space),
     }
@@ -62,6 +63,8 @@ def read_learner(cls: type[OfflineMPCLearner], path: str | PathLike[str]) -> Off
         learner.candidate = check_name("candidate", document["candidate"], error=FileFormatError)
         learner.polish = document["polish"] is True
         learner.soften = check_soften(document["soften"], FileFormatError)
+        if document["keep_limits"] is not None:
+            learner.keep_limits = float(document["keep_limits"])
         if document["candidates"] is not None:
             learner.candidates = Candidates.from_files(document["candidates"], arrays)
         if document["result"] is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.checks import check_integers, check_known
+from mpcoffline.core.checks import check_integers, check_known, check_number
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
@@ -81,6 +81,10 @@ class OfflineMPCLearner:
             at prices from MPC_1's multipliers in states of the log (:func:`mpcoffline.solvers.softened`): where a
             limit cannot be kept, it is violated as little as it must be. ``findings`` and report say which, and how
             dear. None, the default, leaves hard limits hard.
+        keep_limits: In which share of the steps of closed loops on models of the log the given limits are to be kept,
+            e.g. 0.95: those of the best candidate are made tighter until they are (chance constraints by back-off);
+            ``findings`` and report say by how much. None, the default, leaves them as they are. It needs
+            ``candidate="auto"``.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
@@ -102,6 +106,7 @@ class OfflineMPCLearner:
         candidate: As given.
         polish: As given.
         soften: As given.
+        keep_limits: As given.
         candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
             where the method knows of none but the whole fit.
     """
@@ -116,6 +121,7 @@ class OfflineMPCLearner:
         candidate: str = "auto",
         polish: bool = False,
         soften: Soften | None = None,
+        keep_limits: float | None = None,
         method: str | Method | None = None,
         value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
@@ -143,7 +149,11 @@ class OfflineMPCLearner:
         self.method = method.replaced(options)
         self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
         self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
-        self.soften = check_soften(soften)
+        if keep_limits is not None:
+            check_number("keep_limits", keep_limits, 0.0, 1.0)
+            if candidate != "auto":
+                raise InvalidArgumentError("candidate", expected="'auto' with keep_limits", actual=repr(candidate))
+        self.soften, self.keep_limits = check_soften(soften), keep_limits
         self.softening: Softening | None = None
         self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function

@@ -71,7 +71,6 @@ def surroundings_of(
         n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
     n_before = mpc.layout.steps if len(clean) < len(table) else 0
     before = costs_before(table, clean, rows, n_before)
-    clean = clean if cost.limits is None else cost.limits.whole(clean)  # what was paid then, with what limits cost
     return Surroundings(
         models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare, before, n_before
     )
