@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 MOST = 0.3
 
 
-def disturbed(n: int = 24, steps: int = 25) -> TransitionTable:
+def disturbed(n: int = 40, steps: int = 30) -> TransitionTable:
     """The plant about its goal at x = (0.5, 0), pushed at random."""
     rng, rows = np.random.default_rng(0), []
     x = rng.uniform(-0.3, 0.5, (n, 2))
@@ -102,9 +102,9 @@ def test_what_is_kept_stays() -> None:
 
 
 def test_a_learner_hands_them_out(tmp_path: Path) -> None:
-    quick: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "quadratic"}
+    quick: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "given"}
     given = limited([StateBounds([-0.9, -np.inf], [MOST, np.inf], "level", SOFT)])
-    learner = OfflineMPCLearner(given, keep_limits=0.95, seed=0, **quick)
+    learner = OfflineMPCLearner(given, "cost", keep_limits=0.95, seed=0, **quick)
     learner.fit(LOG, show_progress=False)
     assert learner.candidates is not None
     assert learner.candidates.chosen.endswith(", backed off")
