@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
+import numpy as np
+
 from .errors import FileFormatError, InvalidArgumentError, visible
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "c_identifiers",
     "check_name",
     "check_unit",
+    "figure",
     "listed",
     "markdown",
     "markdown_code",
@@ -23,6 +26,7 @@ __all__ = [
 ]
 
 LONGEST = 100  # characters of a name or a unit
+_SMALLEST, _LARGEST = 1e-4, 1e7  # of a number that needs no exponent
 _SIGNS = frozenset(" _-.,^*/()[]+%°µ·0123456789⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻")
 _BLANK_LETTERS = frozenset("\u115f\u1160\u3164\uffa0")  # letters by their class, of which nothing is seen
 _ALPHABET = "letters, digits, blanks and _ - . , ^ * / ( ) [ ] + % ° µ · ² ³"
@@ -127,6 +131,20 @@ def listed(names: Sequence[str], most: int = 6, *, joint: str = ", ") -> str:
     """
     told = joint.join(names[:most])
     return f"{told} and {len(names) - most} more" if len(names) > most else told
+
+
+def figure(value: float, digits: int = 3, *, sign: bool = False) -> str:
+    """A number for people, with some significant digits: ``1060`` rather than ``1.06e+03``.
+
+    Args:
+        value: The number.
+        digits: How many of its digits count.
+        sign: Whether one that is not negative has a plus.
+    """
+    shown = f"{value:{'+' if sign else ''}.{digits}g}"
+    if "e" not in shown or not _SMALLEST <= abs(value) < _LARGEST:
+        return shown
+    return np.format_float_positional(float(shown), trim="-", sign=sign)
 
 
 def c_comment(text: str) -> str:

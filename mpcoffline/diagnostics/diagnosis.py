@@ -124,16 +124,16 @@ def diagnose(
         n_steps=n_steps,
         seed=seed + _FRESH,
     )
-    clone = Behaviour.of(table, learned.layout, seed)
-    deviations = clone.deviations(table, around.rows, around.n_steps)
+    clone = Behaviour.of(around.logged, learned.layout, seed)
+    deviations = clone.deviations(around.logged, around.rows, around.n_steps)
     trials, loops = _tried(chosen, lambda starts: {**policies, TODAY: clone.replaying(deviations[starts])}, around)
     first, second = loops[FIRST], loops[chosen]
     today, rows = clone.replaying(deviations[: around.usual]), around.rows[: around.usual]
-    whole = table if around.cost.limits is None else around.cost.limits.whole(table)
-    trust = _trust(agreement(around.models, around.cost, whole, today, rows, around.n_steps), trials.votes)
+    paid = around.logged if around.cost.limits is None else around.cost.limits.whole(around.logged)
+    trust = _trust(agreement(around.models, around.cost, paid, today, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     plain, priced = (clean, clean) if cost.limits is None else (cost.limits.without(clean), cost.limits.whole(clean))
-    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, table, learned.layout, around)
+    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(

@@ -41,7 +41,6 @@ def chosen_loops(
     trials: Trials,
     proposal: str,
     episodes: Mapping[str, Episodes],
-    table: TransitionTable,
     layout: Layout,
     around: Surroundings,
 ) -> tuple[Loop, ...]:
@@ -51,9 +50,8 @@ def chosen_loops(
         trials: What they cost; only models with a vote count.
         proposal: The controller that is judged.
         episodes: What each controller does from the first starts.
-        table: The transitions, of which ``around.rows`` are the starts.
         layout: Of the states.
-        around: The starts.
+        around: The starts, and the transitions of which they are rows.
 
     Returns:
         Up to three loops; none where no model has a vote.
@@ -64,7 +62,7 @@ def chosen_loops(
     chosen = _chosen(trials, proposal, kept)
     n, found = layout.n_states, []
     for k, why in chosen.items():
-        states, actions = _logged(table, int(around.rows[k]), around.n_steps)
+        states, actions = _logged(around.logged, int(around.rows[k]), around.n_steps)
         on = {name: each.states_kept[trials.votes, k, :, :n] for name, each in episodes.items()}
         inputs = {name: each.actions_kept[trials.votes, k] for name, each in episodes.items()}
         found.append(Loop(int(around.rows[k]), why, states[:, :n], actions, on, inputs))

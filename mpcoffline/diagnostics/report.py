@@ -13,7 +13,7 @@ import numpy as np
 
 from mpcoffline.core.archive import plain
 from mpcoffline.core.outputs import write_file
-from mpcoffline.core.text import listed
+from mpcoffline.core.text import figure, listed
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.plotting import save_figure
 from mpcoffline.simulation.trials import Trials
@@ -175,7 +175,7 @@ class Report:
         for name, cost in costs_of(self.judgement, t):
             known = bool(np.isfinite(cost).any())
             rows.append(
-                (name, *(f"{value:.4g}" if np.isfinite(value) else "?" for value in cost))
+                (name, *(figure(value, 4) if np.isfinite(value) else "?" for value in cost))
                 if known
                 else (name, "", "?", "")
             )
@@ -206,7 +206,7 @@ class Report:
             rows.append(
                 (
                     chosen,
-                    f"{each.difference:+.3g} +- {2.0 * each.error:.2g}",
+                    f"{figure(each.difference, sign=True)} +- {figure(2.0 * each.error, 2)}",
                     f"{each.agree} of {each.of}",
                     f"{each.lost:.1%}",
                 )

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from mpcoffline.core.text import listed
+from mpcoffline.core.text import figure, listed
 from mpcoffline.core.types import Array
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
@@ -148,11 +148,17 @@ def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.4g}"
+    return figure(value, 4)
 
 
 def _pair(mean: float, error: float) -> str:
-    return f"{mean:.3g} +- {SURE * error:.2g}" if np.isfinite(error) else f"{mean:.3g} (from too few starts)"
+    doubt = f"+- {figure(SURE * error, 2)}" if np.isfinite(error) else "(from too few starts)"
+    return f"{figure(mean)} {doubt}"
+
+
+def _called(name: str) -> str:
+    """A candidate's name inside a sentence: with commas it would read as two."""
+    return repr(name) if "," in name else name
 
 
 def _gain(first: Difference, trials: Trials) -> str:
@@ -161,28 +167,33 @@ def _gain(first: Difference, trials: Trials) -> str:
     levels = " -> ".join(_number(_level(trials, name, first, k)) for name in (trials.names[0], first.name))
     kept = np.sort(first.mean)[: n - outvoted(n)]  # but for the one that is dearest
     alike = kept[-1] < 0.0 and kept[0] / kept[-1] < _ALIKE
-    size = "" if alike else f" The models do not agree about the size ({kept[0]:.3g} to {kept[-1]:.3g})."
+    size = "" if alike else f" The models do not agree about the size ({figure(kept[0])} to {figure(kept[-1])})."
     starts = int(starts_of(trials, first.name).sum())
     return (
-        f"{first.name} costs {_pair(-first.mean[k], first.error[k])} less than {trials.names[0]} an episode of"
+        f"{_called(first.name)} costs {_pair(-first.mean[k], first.error[k])} less than {trials.names[0]} an episode of"
         f" {trials.n_steps} steps ({levels}, median model, {starts} starts), beyond two standard"
         f" errors on {int(first.better.sum())} of {n} models that predict the log.{size}"
     )
 
 
 def _no_gain(first: Difference, trials: Trials) -> str:
-    k = first.middle
+    k, name = first.middle, _called(first.name)
     mean, error, n = first.mean[k], first.error[k], int(starts_of(trials, first.name).sum())
     if np.isnan(mean):
-        return f"{first.name} could not be simulated from any start: nothing is known of it."
+        return f"{name} could not be simulated from any start: nothing is known of it."
     if mean - SURE * error > 0.0:
         return (
-            f"{first.name} costs {_pair(mean, error)} more than {trials.names[0]} an episode of {trials.n_steps} steps"
+            f"{name} costs {_pair(mean, error)} more than {trials.names[0]} an episode of {trials.n_steps} steps"
             f" on the median model: dearer beyond two standard errors on {int(first.worse.sum())} of {len(first)}. Look"
             " at the candidates for another one, or record data where the learned MPC goes."
         )
+    if mean == error == 0.0:
+        return (
+            f"{name} costs as much as {trials.names[0]} from each of {n} starts on the median model: in"
+            " simulations there is no gain, and what a trial would show is open."
+        )
     text = (
-        f"{first.name} costs {_pair(abs(mean), error)} {'less' if mean < 0.0 else 'more'} than {trials.names[0]} an"
+        f"{name} costs {_pair(abs(mean), error)} {'less' if mean < 0.0 else 'more'} than {trials.names[0]} an"
         f" episode of {trials.n_steps} steps on the median model: no clear gain."
     )
     if mean + SURE * error < 0.0:
@@ -204,13 +215,13 @@ def _nothing_better(trials: Trials) -> str:
     gain = f"{_pair(abs(best.mean[k]), best.error[k])} {'less' if best.mean[k] < 0.0 else 'more'} an episode"
     if best.mean[k] + SURE * best.error[k] < 0.0:  # it left before the starts that judge, or another went there
         return (
-            f"The choice kept {trials.names[0]}. Of {len(tried)} candidates, {best.name} costs {gain} on the median"
-            f" model from {n} starts, on {int(best.better.sum())} of {len(best)} models clearly, but no other starts"
-            f" have judged it: candidate={best.name!r} hands it out, for diagnose to do so."
+            f"The choice kept {trials.names[0]}. Of {len(tried)} candidates, {_called(best.name)} costs {gain} on the"
+            f" median model from {n} starts, on {int(best.better.sum())} of {len(best)} models clearly, but no other"
+            f" starts have judged it: candidate={best.name!r} hands it out, for diagnose to do so."
         )
     return (
         f"Nothing that was learned is clearly better than {trials.names[0]}: the best of {len(tried)} candidates,"
-        f" {best.name}, costs {gain} on the median model."
+        f" {_called(best.name)}, costs {gain} on the median model."
     )
 
 
@@ -219,7 +230,7 @@ def _objections(first: Difference, trials: Trials) -> tuple[str, ...]:
     objecting = np.flatnonzero(~first.better)
     if not len(objecting):
         return ()
-    names = listed([f"{first.models[k]} ({first.mean[k]:+.3g})" for k in objecting], 4)
+    names = listed([f"{first.models[k]} ({figure(first.mean[k], sign=True)})" for k in objecting], 4)
     if first.agreed:
         return (f"One of {len(first)} models says otherwise, {names}: an outlier, named and not obeyed.",)
     by_cost = (first.mean + SURE * first.error < 0.0) & ~first.better
@@ -245,8 +256,9 @@ def _of_today(today: Today, trials: Trials, name: str) -> tuple[str, ...]:
             else ()
         )
     low, high = today.middle
+    name = _called(name)
     logged = f"what runs today ({_number(today.logged)} in the log)" if np.isfinite(today.logged) else "what runs today"
-    span = f"{low:+.3g} to {high:+.3g}"
+    span = " to ".join(figure(end, sign=True) for end in (low, high))
     if today.better:
         return (f"{name} is better than {logged}: {span} an episode.",)
     worse, also = today.worse, ""
@@ -260,8 +272,8 @@ def _of_today(today: Today, trials: Trials, name: str) -> tuple[str, ...]:
     if np.isfinite(today.disagreement).any():
         gap = float(np.nanmedian(today.disagreement))
         why = (
-            f"on the models a clone of that controller costs {gap:+.3g} of what was logged. A model that explains this"
-            " would decide"
+            f"on the models a clone of that controller costs {figure(gap, sign=True)} of what was logged. A model that"
+            " explains this would decide"
         )
     else:
         why = "more episodes in the log would decide"

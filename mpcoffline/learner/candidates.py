@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
-from mpcoffline.core.text import check_name
+from mpcoffline.core.text import check_name, figure
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
@@ -99,8 +99,8 @@ class Candidates(Mapping[str, MPC]):
             return f"Handed out: MPC_1. None {where} is better for sure."
         gain = np.nanmean(self.trials.differences(chosen)[self.trials.votes], axis=1)
         level = np.nanmean(self.trials.of(FIRST)[self.trials.votes], axis=1)
-        less, other = -float(np.median(gain)), f"MPC_1's {np.median(level):.4g}"
-        cost = f"{less:.3g} less than {other}" if less > 0.0 else f"as much as {other}"
+        less, other = -float(np.median(gain)), f"MPC_1's {figure(float(np.median(level)), 4)}"
+        cost = f"{figure(less)} less than {other}" if less > 0.0 else f"as much as {other}"
         return f"Handed out: {chosen!r}, the best {where} that was confirmed: an episode costs {cost}."
 
     def __str__(self) -> str:
@@ -120,9 +120,11 @@ class Candidates(Mapping[str, MPC]):
         if not tried.any():
             return "not tried"
         if name == FIRST:
-            return f"{np.median(costs[:, tried].mean(axis=1)):.5g} an episode (median of {len(costs)} models)"
+            middle = figure(float(np.median(costs[:, tried].mean(axis=1))), 5)
+            return f"{middle} an episode (median of {len(costs)} models)"
         means = self.trials.differences(name)[self.trials.votes][:, tried].mean(axis=1)
-        return f"{np.median(means):+.3g} (models: {means.min():+.3g} to {means.max():+.3g}), {tried.sum()} starts"
+        middle, low, high = (figure(float(f(means)), sign=True) for f in (np.median, np.min, np.max))
+        return f"{middle} (models: {low} to {high}), {tried.sum()} starts"
 
     @property
     def mpc(self) -> MPC:

@@ -14,6 +14,8 @@ from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.estimation.small_network import SmallNetwork, fit_small_network
 from mpcoffline.mpc.scaling import cost_spread
 
+from .norms import Norms, fit_norms
+
 _FOLDS = 5
 _BLOCKS = 4  # of consecutive rows in a fold, where there are hardly any episodes
 _RIDGES = (1e-9, 1e-6, 1e-4, 1e-2)
@@ -26,6 +28,7 @@ _AS_GOOD = 2.0  # times the squared error that it has when it has seen others of
 _NEXT_TO_NONE = 0.01  # of the variance of the outer ones, which is good enough in any case
 _WIDER = 2.0
 _BETTER = 0.75  # times the squared error of the quadratic on held-out episodes, which is worth another regression
+_LITTLE = 1e-3  # of the variance: what misses no more needs no norms
 
 
 class Fitted(NamedTuple):
@@ -57,7 +60,7 @@ class Corrected(NamedTuple):
         return np.asarray(self.quadratic(x) + self.network(x)[:, 0])
 
 
-Regressed = Fitted | Corrected
+Regressed = Fitted | Corrected | Norms
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,11 @@ class CostRegression:
 
         L(x) = level + scale (g(c) + max(0, q(x) - q(c)))
 
-    So it grows outside as the quadratic does, and is nowhere cheaper than at the border. A quadratic that is exact is
-    taken as it is.
+    So it grows outside as the quadratic does, and is nowhere cheaper than at the border. What is exact, a quadratic or
+    one with norms, is taken as it is.
 
     Attributes:
-        name: ``"a quadratic"`` or ``"a small network"``.
+        name: ``"a quadratic"``, ``"a quadratic with norms"`` or ``"a small network"``.
         level: Mean of the costs.
         scale: Their spread.
         g: The regression, of costs in these units.
@@ -93,8 +96,8 @@ class CostRegression:
 
     @property
     def exact(self) -> bool:
-        """Whether it is the quadratic, and misses nothing."""
-        return self.g is self.q and self.error <= _EXACT
+        """Whether it is no network, and misses nothing."""
+        return not isinstance(self.g, Corrected) and self.error <= _EXACT
 
     def __call__(self, x: Array) -> Array:
         """L of x ``(n, d)``, ``(n,)``."""
@@ -108,12 +111,13 @@ class CostRegression:
 
 
 def cost_regressions(x: Array, cost: Array, folds: NDArray[np.intp], seed: int) -> tuple[CostRegression, ...]:
-    """A quadratic and small networks, by their errors on held-out episodes.
+    """A quadratic, and small networks or norms, by their errors on held-out episodes.
 
-    The quadratic comes first, unless networks have at most three quarters of its squared error: what is richer finds
-    structure in noise, and a controller that is simulated on it gains from that. Then there are two networks, from
+    The quadratic comes first, unless what is richer has at most three quarters of its squared error: that finds
+    structure in noise, and a controller that is simulated on it gains from that. Then there are two of them, from
     other episodes each. (Of 17 logs, 13 kept the quadratic. Where the cost has kinks, or is a norm, a network missed
-    between a third and an eightieth of what random features did.)
+    between a third and an eightieth of what random features did; where it is a distance, norms a quarter of that, and
+    most of what they do not miss is near the goal, where controllers are.)
 
     Args:
         x: (s, a), ``(n, d)``.
@@ -137,12 +141,17 @@ def cost_regressions(x: Array, cost: Array, folds: NDArray[np.intp], seed: int) 
     quadratic = regression("a quadratic", q, q, q.missed)
     if quadratic.exact or len(np.unique(folds)) < _FOLDS:
         return (quadratic,)
-    found = [_network(x, y, folds, pair, rng) for pair in _HELD_OUT[:1]]
+    name, fit = "a small network", _network
+    found = [fit(x, y, folds, _HELD_OUT[0], rng)]
+    if quadratic.error > _LITTLE:
+        other = [_with_norms(x, y, folds, _HELD_OUT[0], rng)]
+        if _ratio(other, y, x, q) <= _BETTER * _ratio(found, y, x, q):
+            name, fit, found = "a quadratic with norms", _with_norms, other
     if _ratio(found, y, x, q) <= _BETTER:
-        found += [_network(x, y, folds, pair, rng) for pair in _HELD_OUT[1:]]
+        found += [fit(x, y, folds, pair, rng) for pair in _HELD_OUT[1:]]
     relative = _ratio(found, y, x, q)
-    networks = [regression("a small network", net, q, q.missed * np.sqrt(relative)) for net, _ in found]
-    return (*networks, quadratic) if relative <= _BETTER else (quadratic, *networks)
+    richer = [regression(name, g, q, q.missed * np.sqrt(relative)) for g, _ in found]
+    return (*richer, quadratic) if relative <= _BETTER else (quadratic, *richer)
 
 
 def folds_of(table: TransitionTable, seed: int) -> NDArray[np.intp]:
@@ -207,9 +216,18 @@ def _believed(x: Array, y: Array, folds: NDArray[np.intp], q: Fitted) -> tuple[A
     return middle + _WIDER * (low - middle), middle + _WIDER * (high - middle)
 
 
+def _with_norms(
+    x: Array, y: Array, folds: NDArray[np.intp], held_out: tuple[int, int], rng: np.random.Generator
+) -> tuple[Regressed, NDArray[np.intp]]:
+    """A quadratic with norms, as :func:`_network`."""
+    test, stop = (np.flatnonzero(folds == k) for k in held_out)
+    seen = np.flatnonzero((folds != held_out[0]) & (folds != held_out[1]))
+    return fit_norms((x[seen], y[seen]), (x[stop], y[stop]), rng), test
+
+
 def _network(
     x: Array, y: Array, folds: NDArray[np.intp], held_out: tuple[int, int], rng: np.random.Generator
-) -> tuple[Corrected, NDArray[np.intp]]:
+) -> tuple[Regressed, NDArray[np.intp]]:
     """A quadratic and a network of what it misses, which ends by one fold, and the rows of the other, not seen."""
     test, stop = (np.flatnonzero(folds == k) for k in held_out)
     seen = np.flatnonzero(folds != held_out[0])
@@ -219,9 +237,9 @@ def _network(
     return Corrected(q, fit_small_network(data, ends, _HIDDEN, rng)), test
 
 
-def _ratio(found: list[tuple[Corrected, NDArray[np.intp]]], y: Array, x: Array, q: Fitted) -> float:
-    """The squared error of networks in that of the quadratic, on the rows that neither has seen."""
-    own = sum(float(np.sum((y[rows] - network(x[rows])) ** 2)) for network, rows in found)
+def _ratio(found: list[tuple[Regressed, NDArray[np.intp]]], y: Array, x: Array, q: Fitted) -> float:
+    """The squared error of regressions in that of the quadratic, on the rows that none has seen."""
+    own = sum(float(np.sum((y[rows] - g(x[rows])) ** 2)) for g, rows in found)
     other = sum(float(np.sum(q.missed[rows] ** 2)) for _, rows in found)
     return own / other if other > 0.0 else 1.0
 

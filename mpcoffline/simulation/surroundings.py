@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, smooth
 from mpcoffline.estimation.plant import state_rows
@@ -21,6 +22,8 @@ _MOST_STEPS = 400
 _MOST_MODELS, _CHOOSING_MODELS = 7, 4
 _FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
 _LEAST_STEPS = 20  # of an episode, or a horizon
+_AS_MUCH = 2.0  # times what a model misses elsewhere
+_NEXT_TO_NOTHING = 0.01  # spreads of the increments
 
 
 def surroundings_of(
@@ -66,14 +69,36 @@ def surroundings_of(
     models = models.asked(most_models, identified=not choosing)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
     spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
+    if len(clean) < len(table):
+        whole = with_memory(table, mpc.layout, identified.usual_input)
+        if _begins_as_usual(identified, whole):
+            logged, clean = whole, whole
+            if not found.noise.negligible:
+                clean = smooth(identified, whole, found.theta, found.noise)
     rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)
     if n_steps is None:
         n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
     n_before = mpc.layout.steps if len(clean) < len(table) else 0
     before = costs_before(table, clean, rows, n_before)
-    return Surroundings(
-        models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare, before, n_before
-    )
+    steps = max(1, n_steps - n_before)
+    return Surroundings(models, cost, clean, rows, steps, mpc.layout, seed, spare, before, n_before, logged)
+
+
+def _begins_as_usual(mpc: MPC, table: TransitionTable) -> bool:
+    """Whether the first transitions of episodes look as if the usual input had been applied before, as the table says.
+
+    That is: whether the model misses them by no more than twice what it misses others.
+    """
+    values, n = table.values(), mpc.layout.n_states
+    missed = (values.next_observations - mpc.model(values.observations, values.actions))[:, :n]
+    _, firsts, lengths = table.episodes
+    order = np.argsort(firsts)
+    first = np.arange(len(table)) - np.repeat(firsts[order], lengths[order]) < mpc.layout.steps
+    if first.all():
+        return False
+    moved = (values.next_observations - values.observations)[:, :n].std(axis=0)
+    size, others = (np.sqrt(np.mean(missed[rows] ** 2, axis=0)) for rows in (first, ~first))
+    return bool((size <= np.maximum(_AS_MUCH * others, _NEXT_TO_NOTHING * moved)).all())
 
 
 def _usual_length(table: TransitionTable) -> int:

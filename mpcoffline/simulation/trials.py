@@ -196,6 +196,7 @@ class Surroundings:
         before: What the log cost from the begin of an episode to a row, ``(starts,)``, which is the same for every
             controller; 0 by default.
         n_before: In how many steps.
+        logged: The transitions as they were logged, where ``table`` is smoothed; its rows are those of the table.
     """
 
     def __init__(
@@ -210,7 +211,9 @@ class Surroundings:
         spare: int = 0,
         before: Array | None = None,
         n_before: int = 0,
+        logged: TransitionTable | None = None,
     ) -> None:
+        self.logged = table if logged is None else logged
         self.models, self.cost, self.rows, self.n_steps, self._layout = models, cost, rows, n_steps, layout
         self.usual, self.n_before = len(rows) - spare, n_before
         self.before = np.zeros(len(rows)) if before is None else before
@@ -227,7 +230,7 @@ class Surroundings:
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
         self._reach = np.where((spread > 0.0) & (np.arange(len(reach)) < layout.n_states), reach, np.inf)
-        self._dearest = float(np.max(paid.costs))
+        self._dearest = float((columns if paid is table else paid.values()).costs.max())
 
     def on(self, models: NDArray[np.intp]) -> Surroundings:
         """The same with some of the models, by number."""

@@ -13,10 +13,11 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
 from .ddp import CompilerError, DDPSolver
-from .interface import SOLVERS, Plan, Solution, Solver
+from .interface import SOLVERS, Solution, Solver
 from .ipopt.solver import IpoptSolver
 from .lqr import LQRSolver
 from .options import check_options
+from .plan import Plan
 from .softening import softened
 from .status import Stats, Status
 

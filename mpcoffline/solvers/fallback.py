@@ -14,8 +14,9 @@ from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
-from .interface import Plan, Solution, Solver
+from .interface import Solution, Solver
 from .ipopt.solver import IpoptSolver
+from .plan import Plan
 
 logger = logging.getLogger(__name__)
 

@@ -18,83 +18,10 @@ from mpcoffline.core.registry import Registry
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
+from .plan import Plan
 from .status import Stats, Status
 
 _FLOAT32 = float(np.finfo(np.float32).eps)
-
-
-class Plan(tuple[Array, ...]):
-    """State and input trajectories, the warm start of the next solve; a row of NaN stands for "no warm start".
-
-    A tuple of two arrays; of three, where the problem has limits and the solver knows their multipliers.
-
-    Args:
-        x: States, ``(B, N + 1, nx)``.
-        u: Inputs, ``(B, N, nu)``.
-        multipliers: ``(B, N + 4, n)`` for n elements of limits: of the stages 0 ... N, then their weights now and at
-            first, and what they are measured by, which all are the solver's own; None or rows of NaN where nothing is
-            known of them.
-    """
-
-    __slots__ = ()
-
-    def __new__(cls, x: Array, u: Array, multipliers: Array | None = None) -> Self:
-        """The arrays as they are."""
-        return super().__new__(cls, (x, u) if multipliers is None else (x, u, multipliers))
-
-    def __getnewargs__(self) -> tuple[Array, ...]:
-        """For copies and pickles."""
-        return tuple(self)
-
-    @property
-    def x(self) -> Array:
-        """States."""
-        return self[0]
-
-    @property
-    def u(self) -> Array:
-        """Inputs."""
-        return self[1]
-
-    @property
-    def multipliers(self) -> Array | None:
-        """Of limits, if they are known."""
-        return self[2] if len(self) > 2 else None
-
-    @classmethod
-    def none(cls, n_problems: int, mpc: MPC) -> Plan:
-        """A plan that warm-starts nothing."""
-        x = np.full((n_problems, mpc.horizon + 1, mpc.nx), np.nan)
-        return cls(x, np.full((n_problems, mpc.horizon, mpc.nu), np.nan))
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Which rows hold a plan, ``(B,)``."""
-        if not len(self.u):
-            return np.zeros(0, dtype=bool)
-        # Zero times NaN or inf is NaN: one product a row, several times faster than looking at each number.
-        with np.errstate(invalid="ignore"):
-            x, u = (a.reshape(len(a), -1) @ np.zeros(a[0].size) for a in self[:2])
-            return np.asarray(x + u == 0.0)
-
-    def shifted(self) -> Plan:
-        """The plan one step later, its last input held."""
-        x = np.concatenate([self.x[:, 1:], self.x[:, -1:]], axis=1)
-        y, last = self.multipliers, self.u.shape[1]
-        if y is not None:
-            y = np.concatenate([y[:, 1 : last + 1], y[:, last:]], axis=1)
-        return Plan(x, np.concatenate([self.u[:, 1:], self.u[:, -1:]], axis=1), y)
-
-    def rows(self, chosen: NDArray[Any]) -> Plan:
-        """Some of the rows."""
-        return Plan(*(array[chosen] for array in self))
-
-    def select(self, keep: NDArray[np.bool_]) -> Plan:
-        """The plan with the other rows forgotten."""
-        arrays = [array.copy() for array in self]
-        for array in arrays:
-            array[~keep] = np.nan
-        return Plan(*arrays)
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from mpcoffline.core.checks import check_integers
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
-from .interface import SOLVERS, OneAtATime, Plan, Solution, Solver
+from .interface import SOLVERS, OneAtATime, Solution, Solver
 from .ipopt.solver import IpoptSolver
 from .linear_quadratic import Extraction, LinearQuadratic, Riccati, misfit
+from .plan import Plan
 from .status import Stats, Status
 
 _TOLERANCE = 1e-8

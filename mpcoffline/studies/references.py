@@ -15,8 +15,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.envs import PLANTS, Plant
 from mpcoffline.envs.episode import EPISODE_STEPS
 from mpcoffline.mpc import MPC, LiftedCost, Model, QuadraticCost
-from mpcoffline.solvers import make_solver
-from mpcoffline.solvers.interface import Plan
+from mpcoffline.solvers import Plan, make_solver
 
 
 def best_known_costs(task: str, states: Array, guesses: Sequence[Array] = (), discount: float = 1.0) -> Array:

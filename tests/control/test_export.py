@@ -48,6 +48,10 @@ def mpc_of(case: str) -> MPC:
         )
         cost, end = (QuadraticCost(np.eye(2), R, tracks={0: "set_point"}) for R in ([[0.1]], None))
         return MPC(model, cost, end, 12, 0.95, [-1.0], [1.0])
+    if case == "turnpike":  # whose plans wait on their way
+        model = Model(lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * u), 2, 1, 0.2, discrete=True)
+        stage, goal = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]]), QuadraticCost(5.0 * np.eye(2), x_ref=[3.0, 0.0])
+        return MPC(model, stage, goal, 40, 1.0, [-5.0], [5.0])
     if case == "stiff motor":  # exact
         model = Model(
             lambda x, u, p: ca.vertcat(100.0 * (x[1] - x[0]), (u[0] - p["R"] * x[1] - 0.05 * x[0]) / p["L"]),
@@ -132,6 +136,7 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
         "signals",
         "signals, no bounds",
         "stiff motor",
+        "turnpike",
         pytest.param("substeps", marks=pytest.mark.slow),
     ],
 )

@@ -14,6 +14,7 @@ from mpcoffline.core.text import (
     c_identifiers,
     check_name,
     check_unit,
+    figure,
     listed,
     markdown,
     markdown_code,
@@ -115,3 +116,25 @@ def test_of_many_names_some_are_told() -> None:
     assert listed(()) == ""
     assert listed(["a", "b"]) == "a, b"
     assert listed([f"p{i}" for i in range(40)], 3, joint=", nor ") == "p0, nor p1, nor p2 and 37 more"
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (1058.3, "1060"),
+        (-1.7e6, "-1700000"),
+        (0.06294, "0.0629"),
+        (3e-9, "3e-09"),
+        (2e9, "2e+09"),
+        (0.0, "0"),
+        (12, "12"),
+    ],
+)
+def test_figures_have_an_exponent_only_where_they_need_one(value: float, said: str) -> None:
+    assert figure(value) == said
+    assert figure(value, sign=True) == (said if value < 0.0 else f"+{said}")
+
+
+@given(st.floats(-1e12, 1e12))
+def test_figures_are_the_numbers(value: float) -> None:
+    assert float(figure(value, 15)) == pytest.approx(value, rel=1e-14)

@@ -59,6 +59,12 @@ def of_quadratic() -> LoggedCost:
 # ---------------------------------------------------------------- which regression
 
 
+def test_a_wavy_cost_is_a_network() -> None:
+    cost = LoggedCost(log(lambda s, a: np.sin(4.0 * s[:, 0]) * np.cos(3.0 * s[:, 1]) + a[:, 0] ** 2))
+    assert "a small network" in str(cost)
+    assert cost.r2 > 0.9
+
+
 def test_a_quadratic_under_noise_stays_one(of_quadratic: LoggedCost) -> None:
     """Networks would find structure in the noise."""
     cost = of_quadratic
@@ -69,8 +75,8 @@ def test_a_quadratic_under_noise_stays_one(of_quadratic: LoggedCost) -> None:
     assert not np.array_equal(cost(*POINTS), cost.second(*POINTS))
 
 
-def test_a_cost_with_kinks_is_a_network_and_so_is_the_check(of_kinked: LoggedCost) -> None:
-    assert "a small network" in str(of_kinked)
+def test_a_cost_with_kinks_has_norms_and_so_has_the_check(of_kinked: LoggedCost) -> None:
+    assert "a quadratic with norms" in str(of_kinked)
     spread = float(np.std(kinked(*POINTS)))
     errors = [(f(*POINTS) - kinked(*POINTS)).std() / spread for f in (of_kinked, of_kinked.second)]
     assert max(errors) < 0.1

@@ -16,12 +16,14 @@ from mpcoffline import MPCPolicy
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.table.memory import with_memory
+from mpcoffline.estimation import identify
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST, choose
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
 from mpcoffline.simulation.starts import costs_before, initial_rows, returns_along
+from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Surroundings, Trials
 
 Array = NDArray[np.float64]
@@ -151,6 +153,27 @@ def test_episodes_cost_what_the_log_did_before_past_inputs_are_known() -> None:
         each.fill({FIRST: MPCPolicy(TRUE_MPC)}, where, slice(None))
     np.testing.assert_allclose(trials[0].cost - trials[1].cost, np.broadcast_to(before[:2], (1, 1, 2)))
     assert (trials[0].n_steps, trials[1].n_steps) == (7, 5)
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_episodes_begin_where_the_log_did_if_nothing_unusual_was_applied_before(before: float) -> None:
+    """A belt that acts two steps late: what it does in the first steps tells what was applied before the log."""
+    mpc, rng, parts = belt_mpc(2, gain=0.5, decay=0.9), np.random.default_rng(0), []
+    for e in range(30):
+        x, past = rng.uniform(0.0, 5.0), [before, before]
+        for _ in range(20):
+            u = rng.uniform()
+            reached = 0.9 * x + 0.5 * past[0] + 0.1 + 0.01 * rng.normal()
+            parts.append(([x], [u], (x - 3.0) ** 2 + 0.02 * u**2, [reached], False, e))
+            x, past = reached, [past[1], u]
+    log = TransitionTable.from_arrays(*(np.array(part) for part in zip(*parts, strict=True)))
+    around = surroundings_of(mpc, mpc, log, identify(mpc, log), n_starts=10)
+    assert around.n_before == (0 if before == 0.0 else 2)
+    assert around.n_before + around.n_steps == 20
+    costs = log.values().costs.reshape(30, 20)
+    assert set(np.round(around.returns, 6)) <= set(np.round(costs.sum(axis=1), 6))
+    if before == 0.0:
+        np.testing.assert_array_equal(around.starts[:, 1:], np.zeros((10, 2)))
 
 
 def test_controllers_together_do_what_each_does_alone() -> None:

@@ -13,7 +13,7 @@ import itertools
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 WINDOW = 4 << 20
+_LOOK = 0.1  # s between two looks for signals
 IN_MEMORY = 128 << 20  # bytes of episodes
 
 T = TypeVar("T")
@@ -179,6 +180,9 @@ def write_steadily(path: Path, job: Callable[[SteadyFile], None]) -> None:
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(work)
         try:
+            # Where Polars is imported, no signal ends a wait: the system takes it up again, unless it has an end.
+            while not wait([done], timeout=_LOOK).done:
+                pass
             done.result()
         except BaseException as error:
             file.stop(error)

@@ -13,6 +13,7 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidDataError
+from mpcoffline.core.types import Array
 
 from .centring import Centring
 from .math import CHUNK
@@ -27,7 +28,7 @@ _ROUNDING = 1e-5  # of a coordinate's spread
 Indices = Sequence[int] | NDArray[np.intp]
 
 
-def with_memory(table: TransitionTable, layout: Layout) -> TransitionTable:
+def with_memory(table: TransitionTable, layout: Layout, usual: Array | None = None) -> TransitionTable:
     """The table with the past inputs that an MPC's state holds as further coordinates of s and s+.
 
     They come from the rows before of the same episode, without a gap between. Rows of which not all past inputs are
@@ -37,6 +38,7 @@ def with_memory(table: TransitionTable, layout: Layout) -> TransitionTable:
     Args:
         table: Transitions, ``ny`` coordinates each.
         layout: Which past inputs.
+        usual: The input that counts as applied before an episode begins, ``(nu,)``: its first rows are kept then.
 
     Returns:
         A table of ``layout.nx`` coordinates; the given one where the layout holds no memory.
@@ -48,7 +50,10 @@ def with_memory(table: TransitionTable, layout: Layout) -> TransitionTable:
     if not layout.n_memory:
         return table
     before = rows_before(table)
-    kept = np.flatnonzero(before >= layout.steps)
+    known = before >= layout.steps
+    if usual is not None:
+        known |= np.isin(np.arange(len(table)) - before, table.episodes.firsts)
+    kept = np.flatnonzero(known)
     if not len(kept):
         raise InvalidDataError(
             f"{table.name}: episodes",
@@ -58,18 +63,22 @@ def with_memory(table: TransitionTable, layout: Layout) -> TransitionTable:
         )
     ny, nu = table.ny, table.nu
     inputs, ages = layout.ages
+    centre = table.centring.centre
+    of_past = centre[ny + inputs]
+    filled = np.asarray(0.0 * of_past if usual is None else layout.filled(usual) - of_past, dtype=np.float32)
 
     def blocks() -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
         for part in (kept[i : i + CHUNK] for i in range(0, len(kept), CHUNK)):
             rows = table.rows[part]
-            first = int(part[0]) - layout.steps
+            first = max(int(part[0]) - layout.steps, 0)
             actions = np.ascontiguousarray(table.rows[first : int(part[-1]) + 1, ny : ny + nu])
-            past, next_past = (actions[(part - first)[:, None] - age, inputs] for age in (ages, ages - 1))
+            past, next_past = (
+                np.where(age <= before[part, None], actions[np.maximum(row - age, first) - first, inputs], filled)
+                for row, age in ((part[:, None], ages), (part[:, None], ages - 1))
+            )
             joined = [rows[:, :ny], past, rows[:, ny : 2 * ny + nu + 1], next_past, rows[:, -1:]]
             yield np.hstack(joined), table.episode_ids[part]
 
-    centre = table.centring.centre
-    of_past = centre[ny + inputs]
     joined = [centre[:ny], of_past, centre[ny : 2 * ny + nu + 1], of_past, centre[-1:]]
     increments = np.append(table.centring.increments, np.zeros(layout.n_memory, dtype=bool))
     return table.rewritten(blocks(), centring=Centring(np.concatenate(joined), increments), sizes=(layout.nx, nu))

@@ -238,6 +238,25 @@ static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
     return found ? 1 : 2;
 }
 
+/* Where the plan can wait for a step: at its end, unless it rests before (a turnpike). */
+static int pause_of(const double *x) {
+    double scale[NX] = {0.0}, moved = 0.0, least = INFINITY;
+    int slowest = MPC_HORIZON;
+    for (int i = 0; i < MPC_HORIZON * NX; ++i) {
+        double step = x[i + NX] - x[i];
+        if (scale[i % NX] < step * step) scale[i % NX] = step * step;
+    }
+    for (int i = 0; i < NX; ++i) scale[i] = 1.0 / scale[i] < INFINITY ? 1.0 / scale[i] : 0.0;
+    for (int k = 0; k < MPC_HORIZON; ++k) {
+        double before = moved;
+        moved = 0.0;
+        for (int i = k * NX; i < (k + 1) * NX; ++i) moved += (x[i + NX] - x[i]) * (x[i + NX] - x[i]) * scale[i % NX];
+        if (k > 0 && before + moved < least) least = before + moved, slowest = k;
+    }
+    if (MPC_HORIZON < 3 || !(least < 2.0 * 0.01 * NX) || !(least < 2.0 * 0.25 * moved)) return MPC_HORIZON;
+    return slowest;
+}
+
 int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NY], double u[MPC_NU]) {
 #if LIMITS
     const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, MPC_MAX_ITERATIONS, TOLERANCE, 0};
@@ -267,11 +286,12 @@ int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[
     }
     for (int a = 0; a < NU; ++a) u[a] = clip(state->u[a], low[a], high[a]);
     remember(state, u);
-    /* The plan of the next step, its last input held. */
-    for (int i = 0; i < (MPC_HORIZON - 1) * NU; ++i) state->u[i] = state->u[i + NU];
-    for (int i = 0; i < MPC_HORIZON * NX; ++i) state->x[i] = state->x[i + NX];
+    /* The plan of the next step. */
+    int pause = pause_of(state->x);
+    for (int i = 0; i < (pause < MPC_HORIZON ? pause : MPC_HORIZON - 1) * NU; ++i) state->u[i] = state->u[i + NU];
+    for (int i = 0; i < pause * NX; ++i) state->x[i] = state->x[i + NX];
 #if LIMITS
-    for (int i = 0; i < MPC_HORIZON * LIMITS; ++i) state->limits[i] = state->limits[i + LIMITS];
+    for (int i = 0; i < pause * LIMITS; ++i) state->limits[i] = state->limits[i + LIMITS];
 #endif
     return answer;
 }

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.corners import Corner, rounded_mpc
-from mpcoffline.solvers.interface import Plan
+from mpcoffline.solvers.plan import Plan
 
 logger = logging.getLogger(__name__)
 

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import SOLVERS, Plan, Solution, Solver
+from mpcoffline.solvers.interface import SOLVERS, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
+from mpcoffline.solvers.plan import Plan
 from mpcoffline.solvers.scaling import cost_constant, input_units
 from mpcoffline.solvers.starts import N_CANDIDATES, candidate_inputs
 from mpcoffline.solvers.status import Stats, Status

@@ -12,7 +12,7 @@ import numpy as np
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Plan
+from mpcoffline.solvers.plan import Plan
 from mpcoffline.solvers.starts import candidate_inputs
 from mpcoffline.solvers.status import Status
 

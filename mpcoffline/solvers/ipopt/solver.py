@@ -10,9 +10,10 @@ import numpy as np
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import SOLVERS, OneAtATime, Plan, Solution, Solver
+from mpcoffline.solvers.interface import SOLVERS, OneAtATime, Solution, Solver
 from mpcoffline.solvers.linear_quadratic import is_convex
 from mpcoffline.solvers.options import check_options
+from mpcoffline.solvers.plan import Plan
 from mpcoffline.solvers.starts import N_CANDIDATES
 from mpcoffline.solvers.status import Stats
 

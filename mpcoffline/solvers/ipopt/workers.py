@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from mpcoffline.core.parallel import EXECUTORS, Executor, n_cpus
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.interface import Plan
+from mpcoffline.solvers.plan import Plan
 
 from .program import Found, Programs
 

@@ -29,12 +29,17 @@ def make_table(
     return TransitionTable.from_arrays(*(column[kept] for column in columns))
 
 
-def by_hand(table: TransitionTable, layout: Layout) -> list[np.ndarray]:
-    """Row by row: [s, past inputs], [s+, past inputs after a]; rows with a break among their past are left out."""
+def by_hand(table: TransitionTable, layout: Layout, usual: np.ndarray | None = None) -> list[np.ndarray]:
+    """Row by row: [s, past inputs], [s+, past inputs after a]; rows with a break among their past are left out.
+
+    With a usual input before each episode, only those after a gap.
+    """
     found, y, a = [], table.values(), table.values().actions
     inputs, ages = layout.ages
     for row in range(len(table)):
-        before = range(row - layout.steps + 1, row + 1)
+        first = int(np.flatnonzero(table.episode_ids == table.episode_ids[row])[0])
+        past = np.vstack([*[usual if usual is not None else np.zeros(2)] * layout.steps, a[first : row + 1]])
+        before = range(max(row - layout.steps, -1 if usual is None else first) + 1, row + 1)
         unbroken = all(
             k > 0
             and table.episode_ids[k] == table.episode_ids[k - 1]
@@ -42,7 +47,7 @@ def by_hand(table: TransitionTable, layout: Layout) -> list[np.ndarray]:
             for k in before
         )
         if unbroken:
-            now, later = ([a[row - g + j, i] for i, g in zip(inputs, ages, strict=True)] for j in (0, 1))
+            now, later = ([past[-1 - g + j, i] for i, g in zip(inputs, ages, strict=True)] for j in (0, 1))
             s, reached = y.observations[row], y.next_observations[row]
             found.append(np.concatenate([s, now, a[row], reached, later, [row]]))
     return found
@@ -53,16 +58,19 @@ def by_hand(table: TransitionTable, layout: Layout) -> list[np.ndarray]:
     st.lists(st.integers(1, 9), min_size=1, max_size=6),
     st.lists(st.integers(0, 3), min_size=2, max_size=2),
     st.lists(st.integers(0, 40), max_size=4),
+    st.booleans(),
 )
-def test_past_inputs_are_those_of_the_rows_before(lengths: list[int], delay: list[int], gaps: list[int]) -> None:
-    layout = Layout.of(2, 2, delay)
+def test_past_inputs_are_those_of_the_rows_before(
+    lengths: list[int], delay: list[int], gaps: list[int], begins: bool
+) -> None:
+    layout, usual = Layout.of(2, 2, delay), np.array([0.25, -0.5]) if begins else None
     table = make_table([6, *lengths], gaps=tuple(g + 5 for g in gaps))
-    expected = by_hand(table, layout)
+    expected = by_hand(table, layout, usual)
     if layout.n_memory and not expected:
         with pytest.raises(InvalidDataError, match="consecutive rows"):
             with_memory(table, layout)
         return
-    found = with_memory(table, layout)
+    found = with_memory(table, layout, usual)
     v = found.values()
     np.testing.assert_array_equal(
         np.hstack([v.observations, v.actions, v.next_observations]), np.array(expected)[:, :-1]
@@ -80,6 +88,14 @@ def test_offsets_keep_their_digits() -> None:
     np.testing.assert_array_equal(found.observations[:, 2], table.actions[1:-1, 0])
     np.testing.assert_array_equal(found.next_observations[:, 3], table.actions[1:-1, 0])
     np.testing.assert_array_equal(found.next_observations[:, :2], table.next_observations[2:])
+
+
+def test_what_counts_as_applied_before_keeps_its_digits_to_the_offset() -> None:
+    table, layout = make_table([9, 9], offset=1e7), Layout.of(2, 2, [2, 1])
+    found = with_memory(table, layout, np.array([1e7 + 1.0, 1e7]))
+    assert len(found) == len(table)
+    np.testing.assert_allclose(found.observations[[0, 9], 2:] - 1e7, [[1.0, 1.0, 0.0]] * 2, atol=1e-6)
+    np.testing.assert_array_equal(found.next_observations[:, 2], table.actions[:, 0])
 
 
 def test_states_measured_twice_are_no_gaps() -> None:

@@ -341,12 +341,6 @@ def test_a_useless_warm_start_does_no_harm() -> None:
     np.testing.assert_allclose(misled.value, cold.value, rtol=1e-5, atol=1e-5)
 
 
-def test_shifted_plans() -> None:
-    plan = Plan(np.arange(4.0).reshape(1, 4, 1), np.arange(3.0).reshape(1, 3, 1))
-    assert plan.shifted().x.ravel().tolist() == [1, 2, 3, 3]
-    assert plan.shifted().u.ravel().tolist() == [1, 2, 2]
-
-
 def test_theta_is_an_argument() -> None:
     solver = IpoptSolver(integrator())
     theta = solver.mpc.space.pack({"stage_cost.R": [[10.0]]})

@@ -1,0 +1,133 @@
+"""Regressions with norms: costs that are distances, or sums of absolute errors, beside a quadratic."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from mpcoffline.core.types import Array
+from mpcoffline.estimation.features import RandomFeatures
+from mpcoffline.mpc.scaling import spread_of
+
+_SHAPES = ((1, 3), (2, 3), (3, 1))  # norms, and how many directions each is of: a distance, two, absolute errors
+_STARTS = 4  # of each
+_OPTIONS: Any = {"maxiter": 300, "maxcor": 30, "ftol": 1e-9, "gtol": 1e-8}
+_ROWS = 2_000
+_RIDGE = 1e-9  # of the mean square of the features
+_WIDTH = 0.4  # of a kink, in spreads, to begin with
+_SHARPEST, _WIDEST = 1e-6, 1e2  # likewise, at the end
+
+
+class Norms(NamedTuple):
+    """A quadratic and norms of affine functions, which may have sharp kinks.
+
+    ::
+
+        L(x) = c' q(x) + sum_j w_j sqrt(|C_j z + d_j|^2 + e_j^2),   z = (x - mean) / spread
+
+    Attributes:
+        features: q, the products of two entries of x, the entries, and 1.
+        mean: Of x, ``(d,)``.
+        spread: Likewise.
+        directions: C, ``(j, r, d)``.
+        offsets: d, ``(j, r)``.
+        widths: Logarithms of e, ``(j,)``.
+        weights: c and w, ``(m + j,)``.
+    """
+
+    features: RandomFeatures
+    mean: Array
+    spread: Array
+    directions: Array
+    offsets: Array
+    widths: Array
+    weights: Array
+
+    def __call__(self, x: Array) -> Array:
+        """Of x ``(n, d)``, ``(n,)``."""
+        norms = _norms((x - self.mean) / self.spread, self.directions, self.offsets, self.widths)[1]
+        return np.asarray(np.hstack([self.features(x), norms]) @ self.weights)
+
+
+def fit_norms(data: tuple[Array, Array], ends: tuple[Array, Array], rng: np.random.Generator) -> Norms:
+    """Learns one by least squares from several starts: of some shapes, the one that is best on other rows.
+
+    What enters linearly is solved for at each step (variable projection: Golub and Pereyra,
+    doi:10.1137/0710036).
+
+    Args:
+        data: x ``(n, d)`` and costs ``(n,)`` to learn from, costs of about unit size.
+        ends: Others, by which the shape is chosen.
+        rng: Draws rows and starts.
+    """
+    x, y = data
+    if len(x) > _ROWS:
+        kept = np.sort(rng.permutation(len(x))[:_ROWS])
+        x, y = x[kept], y[kept]
+    features, mean, spread = RandomFeatures(x, 0, rng), x.mean(axis=0), spread_of(x)
+    projected = _Projected(features(x), (x - mean) / spread, y)
+    found: list[tuple[float, Norms]] = []
+    for count, size in _SHAPES:
+        for _ in range(_STARTS):
+            parts = projected.solved(count, min(size, x.shape[1]), rng)
+            norms = Norms(features, mean, spread, *parts)
+            found.append((float(np.mean((norms(ends[0]) - ends[1]) ** 2)), norms))
+    return min(found, key=lambda each: each[0])[1]
+
+
+class _Projected:
+    """The squared error as a function of what enters nonlinearly, the rest being the best."""
+
+    def __init__(self, q: Array, z: Array, y: Array) -> None:
+        self._q, self._z, self._y = q, z, y
+        self._gram, self._slope = q.T @ q / len(q), q.T @ y / len(q)
+        self._ridge = _RIDGE * float(np.trace(self._gram)) / len(self._gram)
+
+    def solved(self, count: int, size: int, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+        """Directions, offsets, logarithms of widths and weights of a number of norms of some directions each."""
+        d = self._z.shape[1]
+        self._shapes = (count, size, d), (count, size), (count,)
+        start = [
+            rng.standard_normal(self._shapes[0]).ravel() / np.sqrt(d),
+            0.3 * rng.standard_normal(count * size),
+            np.full(count, np.log(_WIDTH)),
+        ]
+        bounds = [(None, None)] * (count * size * (d + 1)) + [(np.log(_SHARPEST), np.log(_WIDEST))] * count
+        done = scipy.optimize.minimize(
+            self._error, np.concatenate(start), jac=True, method="L-BFGS-B", bounds=bounds, options=_OPTIONS
+        )
+        parts = self._parts(done.x)
+        return (*parts, self._weights(_norms(self._z, *parts)[1]))
+
+    def _parts(self, p: Array) -> tuple[Array, Array, Array]:
+        ends = np.cumsum([int(np.prod(shape)) for shape in self._shapes])[:-1]
+        directions, offsets, widths = (part.reshape(s) for part, s in zip(np.split(p, ends), self._shapes, strict=True))
+        return directions, offsets, widths
+
+    def _weights(self, norms: Array) -> Array:
+        n = len(norms)
+        mixed = self._q.T @ norms / n
+        gram = np.block([[self._gram, mixed], [mixed.T, norms.T @ norms / n]])
+        gram[np.diag_indices_from(gram)] += self._ridge
+        return np.asarray(np.linalg.solve(gram, np.append(self._slope, norms.T @ self._y / n)))
+
+    def _error(self, p: Array) -> tuple[float, Array]:
+        directions, offsets, widths = self._parts(p)
+        v, norms = _norms(self._z, directions, offsets, widths)
+        weights = self._weights(norms)
+        missed = self._q @ weights[: self._q.shape[1]] + norms @ weights[self._q.shape[1] :] - self._y
+        # At the best weights their own derivatives are zero: only the explicit ones are left.
+        pull = 2.0 / len(missed) * missed[:, None] * weights[self._q.shape[1] :] / norms
+        by_offset = np.einsum("nj,njr->njr", pull, v)
+        by_width = pull.sum(axis=0) * np.exp(2.0 * widths)
+        slopes = np.einsum("njr,nd->jrd", by_offset, self._z), by_offset.sum(axis=0), by_width
+        error = float(np.mean(missed**2)) + self._ridge * float(weights @ weights)
+        return error, np.concatenate([slope.ravel() for slope in slopes])
+
+
+def _norms(z: Array, directions: Array, offsets: Array, widths: Array) -> tuple[Array, Array]:
+    """``C_j z + d_j`` ``(n, j, r)`` and the norms ``(n, j)``."""
+    v = np.einsum("jrd,nd->njr", directions, z) + offsets
+    return v, np.sqrt(np.square(v).sum(axis=2) + np.exp(2.0 * widths))
