@@ -138,10 +138,11 @@ def diagnose(
     first, second = loops[FIRST], loops[chosen]
     usual = np.flatnonzero(~others[: around.usual])
     rows, acting = around.rows[usual], clone.replaying(deviations[usual])
-    trust = None
+    paid, trust = logs if around.cost.limits is None else around.cost.limits.whole(logs), None
     if len(rows):
-        trust = _trust(agreement(around.models, around.cost, logs, acting, rows, around.n_steps), trials.votes)
+        trust = _trust(agreement(around.models, around.cost, paid, acting, rows, around.n_steps), trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
+    plain, priced = (clean, clean) if cost.limits is None else (cost.limits.without(clean), cost.limits.whole(clean))
     shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
@@ -156,7 +157,7 @@ def diagnose(
         choice=choice,
         rules=tuple(rules),
     )
-    limits = limit_checks(nominal, table, first, second) if nominal.constraints is not None else ()
+    limits = limit_checks(nominal, table, first, second, learned) if nominal.constraints is not None else ()
     if chosen != FIRST:
         judgement = with_limits(judgement, limits)
     reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
@@ -166,8 +167,8 @@ def diagnose(
         choice=choice,
         notes=(),
         cost_r2=cost.r2,
-        value=value_check(learner.value_function, clean, learned.discount),
-        fit=fit_errors(nominal, learned, learner.value_function, clean, learner.result),
+        value=value_check(learner.value_function, priced, learned.discount),
+        fit=fit_errors(nominal, learned, learner.value_function, plain, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
         theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second),
         weights=weight_checks(nominal, learned, clean),
@@ -183,7 +184,7 @@ def diagnose(
         traces=Traces(
             first.states[..., : learned.layout.n_states],
             second.states[..., : learned.layout.n_states],
-            np.stack(returns_of(learner.value_function, clean, learned.discount)),
+            np.stack(returns_of(learner.value_function, priced, learned.discount)),
             reference,
         ),
         trust=trust,
@@ -201,7 +202,7 @@ def diagnose(
     cost_kept = learner.result is not None and learner.result.cost is not None and learner.result.cost.constant
     fit = Fit(
         learner.method.options.get("init") == "identified",
-        learner.learn == "cost+model",
+        learner.learn != "cost",
         not cost_kept,
         chosen != FIRST,
     )

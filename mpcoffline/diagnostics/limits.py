@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,10 +11,10 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC, Penalty
 from mpcoffline.simulation.trials import Episodes
+from mpcoffline.simulation.violations import TRIFLE, limit_functions, moved
 
 from .verdict import Judgement
 
-_TRIFLE = 1e-3  # of how far h moves: a violation by less is rounding and noise
 _SURE = 2.0  # standard errors
 _LEAST = 0.005  # of the steps: a smaller difference is none
 
@@ -30,7 +28,7 @@ class LimitCheck:
 
     Attributes:
         name: Of the constraint.
-        kind: ``"hard"``, or its prices.
+        kind: ``"hard"``, or its prices; and those that the proposal has, where they are others.
         shares: Of the steps of the log, of MPC_1's and of the proposal's that violate it.
         largest: The largest violation of each, 0 for none, in the unit of the element of h that has it.
         worse: Whether the proposal violates it in more steps than MPC_1, beyond two standard errors.
@@ -43,7 +41,9 @@ class LimitCheck:
     worse: bool
 
 
-def limit_checks(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Episodes) -> tuple[LimitCheck, ...]:
+def limit_checks(
+    mpc: MPC, table: TransitionTable, first: Episodes, proposal: Episodes, learned: MPC | None = None
+) -> tuple[LimitCheck, ...]:
     """Counts violations.
 
     Args:
@@ -51,22 +51,25 @@ def limit_checks(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Ep
         table: The log, in the MPC's states.
         first: What MPC_1 does.
         proposal: What the controller does that is judged.
+        learned: The MPC that it is, of which hard limits may have become soft.
     """
+    now = {} if learned is None else {limit.name: limit.soft for limit in limit_functions(learned)}
     columns = table.values()
     log = columns.observations[None], np.asarray(columns.actions, dtype=np.float64)[None]
     runs = [log, *((each.states[:, :-1], each.actions) for each in (first, proposal))]
     found = []
-    for name, soft, function in _limits(mpc):
-        elements = [_along(function, *run, mpc.theta) for run in runs]
-        together = np.concatenate([h.reshape(-1, h.shape[-1]) for h in elements])
-        moved = np.ptp(np.where(np.isfinite(together), together, 0.0), axis=0)
-        violated = [(h > _TRIFLE * moved).any(axis=-1) for h in elements]
+    for limit in limit_functions(mpc):
+        name, soft, _ = limit
+        elements = [limit.along(*run, mpc.theta) for run in runs]
+        far = moved(np.concatenate([h.reshape(-1, h.shape[-1]) for h in elements]))
+        violated = [(h > TRIFLE * far).any(axis=-1) for h in elements]
         shares = tuple(float(each.mean()) for each in violated)
         more = violated[2].mean(axis=1) - violated[1].mean(axis=1)
         error = more.std() / np.sqrt(len(more))
-        largest = tuple(_largest(h, moved) for h in elements)
+        largest = tuple(_largest(h, far) for h in elements)
         worse = bool(more.mean() > max(_SURE * error, _LEAST))
-        found.append(LimitCheck(name, _kind(soft), _three(shares), _three(largest), worse))
+        kind = _kind(soft) if soft == now.get(name, soft) else f"{_kind(soft)}, handed out with {_kind(now[name])}"
+        found.append(LimitCheck(name, kind, _three(shares), _three(largest), worse))
     return tuple(found)
 
 
@@ -84,29 +87,10 @@ def with_limits(judgement: Judgement, checks: tuple[LimitCheck, ...]) -> Judgeme
     return replace(judgement, verdict=kept, reasons=(*judgement.reasons[:1], *told, *judgement.reasons[1:]))
 
 
-def _limits(mpc: MPC) -> Iterator[tuple[str, Penalty | None, ca.Function]]:
-    """Names, prices and ``(x, u, theta) -> h`` of all limits along the horizon."""
-    x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
-    for constraint in mpc.constraints_at("stages"):
-        h = ca.densify(mpc.constraint_expression(constraint)(x, u, theta))
-        yield constraint.name, constraint.soft, ca.Function("h", [x, u, theta], [h])
-    for bounds in mpc.state_bounds:
-        h = ca.densify(bounds.expression(x))
-        if h.numel():
-            yield bounds.name, bounds.soft, ca.Function("h", [x, u, theta], [h])
-
-
-def _along(function: ca.Function, x: Array, u: Array, theta: Array) -> Array:
-    """H along trajectories ``(B, T, nx)``, ``(B, T, nu)``: ``(B, T, n)``."""
-    flat = [part.reshape(-1, part.shape[-1]).T for part in (x, u)]
-    h: Array = function(*flat, theta).full().T
-    return h.reshape(*x.shape[:2], -1)
-
-
-def _largest(h: Array, moved: Array) -> float:
+def _largest(h: Array, far: Array) -> float:
     """The largest of the violations, each compared with others by how far its element moves."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative: NDArray[np.float64] = np.nan_to_num(np.maximum(h, 0.0) / moved, nan=0.0, posinf=0.0)
+        relative: NDArray[np.float64] = np.nan_to_num(np.maximum(h, 0.0) / far, nan=0.0, posinf=0.0)
     return float(max(h.reshape(-1)[relative.argmax()], 0.0))
 
 

@@ -16,6 +16,7 @@ from mpcoffline.core.text import check_name, figure
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
+from mpcoffline.simulation.back_offs import BackOffs, backed_off
 from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy
 from mpcoffline.simulation.polishing import polished
 from mpcoffline.simulation.surroundings import surroundings_of
@@ -28,9 +29,14 @@ if TYPE_CHECKING:
     from .run import Run
 
 FULL = "full"
+TIGHTER = ", backed off"  # after the name of one whose limits were made tighter
 TRIALS = "trials/"  # in front of the names of their arrays in a file
 
 logger = logging.getLogger(__name__)
+
+
+def _as_it_is(mpc: MPC) -> MPC:
+    return mpc
 
 
 @dataclass(frozen=True)
@@ -45,11 +51,13 @@ class Candidates(Mapping[str, MPC]):
         mpcs: By name: ``"MPC_1"``, ``"full"`` and those between.
         chosen: The one that the learner hands out.
         trials: Their closed loops on models of the log; None where one was taken by name.
+        back_offs: How the limits of the chosen one were made tighter, where that was asked for.
     """
 
     mpcs: Mapping[str, MPC]
     chosen: str
     trials: Trials | None = None
+    back_offs: BackOffs | None = None
 
     def __getitem__(self, name: str) -> MPC:
         """The MPC of a name.
@@ -75,20 +83,25 @@ class Candidates(Mapping[str, MPC]):
 
     @property
     def finding(self) -> str:
-        """Which one was chosen and why, in a sentence."""
+        """Which one was chosen and why, and which limits are tighter than they were given, in sentences."""
+        return self._choice if self.back_offs is None else f"{self._choice} {self.back_offs}"
+
+    @property
+    def _choice(self) -> str:
+        chosen = self.chosen.removesuffix(TIGHTER)
         if self.trials is None:
             return f"Handed out: {self.chosen!r}, as was asked."
         votes = int(self.trials.votes.sum())
         if not votes:
             return "Handed out: MPC_1. No model predicts the log, so nothing could be tried."
         where = f"of {len(self)} candidates in closed loop with {votes} model{'s' * (votes > 1)} of the log"
-        if self.chosen == FIRST:
+        if chosen == FIRST:
             return f"Handed out: MPC_1. None {where} is better for sure."
-        gain = np.nanmean(self.trials.differences(self.chosen)[self.trials.votes], axis=1)
+        gain = np.nanmean(self.trials.differences(chosen)[self.trials.votes], axis=1)
         level = np.nanmean(self.trials.of(FIRST)[self.trials.votes], axis=1)
         less, other = -float(np.median(gain)), f"MPC_1's {figure(float(np.median(level)), 4)}"
         cost = f"{figure(less)} less than {other}" if less > 0.0 else f"as much as {other}"
-        return f"Handed out: {self.chosen!r}, the best {where} that was confirmed: an episode costs {cost}."
+        return f"Handed out: {chosen!r}, the best {where} that was confirmed: an episode costs {cost}."
 
     def __str__(self) -> str:
         """A line each: cost of an episode less that of MPC_1, over the models that have a vote."""
@@ -122,7 +135,8 @@ class Candidates(Mapping[str, MPC]):
         """A JSON-able description, of the trials the names."""
         models = None if self.trials is None else list(self.trials.models)
         mpcs = {name: mpc.to_json() for name, mpc in self.mpcs.items()}
-        return {"mpcs": mpcs, "chosen": self.chosen, "models": models}
+        tighter = None if self.back_offs is None else self.back_offs.to_json()
+        return {"mpcs": mpcs, "chosen": self.chosen, "models": models, "back_offs": tighter}
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The numbers of the trials."""
@@ -145,7 +159,8 @@ class Candidates(Mapping[str, MPC]):
             own = {name.removeprefix(TRIALS): v for name, v in arrays.items() if name.startswith(TRIALS)}
             named = tuple(check_name("model", name, error=FileFormatError) for name in models)
             trials = Trials.from_arrays(tuple(mpcs), named, own)
-        return cls(mpcs, chosen, trials)
+        tighter = None if data["back_offs"] is None else BackOffs.from_json(mpcs[chosen], data["back_offs"])
+        return cls(mpcs, chosen, trials, tighter)
 
 
 def check_also(nominal: MPC, also: Mapping[str, MPC]) -> None:
@@ -172,13 +187,18 @@ def candidates_of(
     Raises:
         UnknownIdError: If it was asked for a candidate that there is none of.
     """
-    known, nominal = run.known, learner.nominal_mpc
+    known, nominal, soft = run.known, learner.nominal_mpc, learner.softening
     between = {} if learner.candidate == FULL else run.method.candidates(known)
     between = {**between, **also} if between or learner.candidate != "auto" else between
     if learner.candidate == "auto":
         show, variants = partial(bars.show, "choosing on models of the log"), partial(run.method.variants, known)
-        return tried(nominal, known, between, table, variants, show, polish=learner.polish) if between else None
-    found = Candidates({FIRST: nominal, **between, FULL: known.mpc}, learner.candidate)
+        if not between:
+            return None
+        how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
+        how["ready"] = _as_it_is if soft is None else soft
+        return tried(nominal, known, between, table, variants, show, **how)
+    mpcs = {FIRST: nominal, **between, FULL: known.mpc}
+    found = Candidates(mpcs if soft is None else {name: soft(mpc) for name, mpc in mpcs.items()}, learner.candidate)
     _ = found.mpc  # refuses a name that is none of them
     return None if learner.candidate == FULL else found
 
@@ -192,6 +212,8 @@ def tried(
     tell: Callable[[int, int, str], None],
     *,
     polish: bool = False,
+    keep_limits: float | None = None,
+    ready: Callable[[MPC], MPC] = _as_it_is,
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -203,11 +225,13 @@ def tried(
         variants: Of good ones.
         tell: Is told how many starts of how many are done, and what is tried.
         polish: Whether the best one's weights are moved by what closed loops cost.
+        keep_limits: In which share of its simulated steps the best one is to keep the given limits.
+        ready: What becomes of each before it is tried.
     """
-    mpcs = _different({FIRST: nominal, **between, FULL: known.mpc})
+    mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    slow = are_slow(quick_policy(mpc) for mpc in (nominal, known.mpc))
+    slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
     around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
     if polish:
@@ -217,7 +241,12 @@ def tried(
             mpcs, trials = {**mpcs, name: better.mpc}, trials.with_names([name])
             trials.fill({name: quick_policy(better.mpc)}, around, slice(0, len(trials.rows)))
             chosen = name if trials.improves(name) else chosen
-    found = Candidates(mpcs, chosen, trials)
+    tighter = None if keep_limits is None else backed_off(mpcs[chosen], around, keep_limits, tell)
+    if tighter is not None and tighter.mpc is not mpcs[chosen]:
+        chosen += TIGHTER
+        mpcs, trials = {**mpcs, chosen: tighter.mpc}, trials.with_names([chosen])
+        trials.fill({chosen: quick_policy(tighter.mpc)}, around, slice(0, len(trials.rows)))
+    found = Candidates(mpcs, chosen, trials, tighter)
     if chosen == FIRST:
         logger.warning("%s\n%s", found.finding, found)
     else:

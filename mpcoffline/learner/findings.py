@@ -18,6 +18,11 @@ def findings(given: MPC, learned: MPC, result: FitResult | None) -> tuple[str, .
     if result is not None and result.cost is not None:
         kept = "the given stage and terminal cost stay" if result.cost.constant else "the stage cost is not learned"
         found.append(f"Logged cost: {result.cost}; {kept}.")
+    if result is not None and result.limits is not None:
+        scale, logged = result.limits
+        seen = "the logged costs contain them" if logged else "they were added to the logged costs"
+        unit = "" if scale == 1.0 else f", times {scale:.4g}"
+        found.append(f"Prices of soft limits: V has learned them, {seen}{unit}.")
     if learned.model.delay != given.model.delay:
         found.append(f"Dead time: {list(learned.layout.delay)} steps, found in the log.")
     if learned.model.scheme is not None and learned.model.scheme != given.model.scheme:

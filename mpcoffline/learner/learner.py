@@ -6,15 +6,14 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
-from mpcoffline.core.checks import check_integers, check_known
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.checks import check_integers, check_known, check_number
+from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.notebook import html_of
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
@@ -24,16 +23,18 @@ from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.shown import parameter_table
 
-from .candidates import FULL, TRIALS, Candidates, candidates_of, check_also
-from .checkpoint import Checkpoint, History, history_from_json
+from .candidates import Candidates, candidates_of, check_also
+from .checkpoint import Checkpoint, History
+from .files import read_learner, write_learner
 from .findings import findings
 from .presets import PRESETS
 from .run import Run
+from .softening import Soften, Softening, check_soften, softening_found
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-Learn = Literal["cost", "cost+model"]
+Learn = Literal["cost", "cost+model", "cost+model+constraints"]
 #: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
 Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
 #: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
@@ -42,7 +43,7 @@ Callback = Callable[["OfflineMPCLearner", int, int], Any]
 
 logger = logging.getLogger(__name__)
 
-_GROUPS: dict[str, tuple[str, ...]] = {"cost": ("cost",), "cost+model": ("cost", "model")}
+_GROUPS: dict[str, tuple[str, ...]] = {name: tuple(name.split("+")) for name in get_args(Learn)}
 
 
 class OfflineMPCLearner:
@@ -66,7 +67,8 @@ class OfflineMPCLearner:
 
     Args:
         mpc: MPC_1: the nominal MPC. It is never changed.
-        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3). A dead time
+        learn: ``"cost"`` fits the stage cost with the model fixed (MPC_2), ``"cost+model"`` both (MPC_3),
+            ``"cost+model+constraints"`` besides parameters that soft limits alone depend on, as back-offs. A dead time
             that the model does not state (``delay=None``) is taken from the log in either case.
         preset: Name of a learning method with options in ``mpcoffline.learner.PRESETS``: ``"paper"`` is the published
             recipe, ``"default"`` what most users should get, ``"fast"`` has the shortest horizon, ``"best"`` the
@@ -77,6 +79,14 @@ class OfflineMPCLearner:
             takes that one and tries nothing. The paper's preset has no others than the whole fit.
         polish: Whether weights of the best candidate are moved, too, by what closed loops on models of the log cost
             (``mpcoffline.simulation.polishing``); needs ``pip install "mpcoffline[polish]"``.
+        soften: ``"auto"`` puts exact penalties in place of the hard limits of all candidates and of what is handed out,
+            at prices from MPC_1's multipliers in states of the log (:func:`mpcoffline.solvers.softened`): where a
+            limit cannot be kept, it is violated as little as it must be. ``findings`` and report say which, and how
+            dear. None, the default, leaves hard limits hard.
+        keep_limits: In which share of the steps of closed loops on models of the log the given limits are to be kept,
+            e.g. 0.95: those of the best candidate are made tighter until they are (chance constraints by back-off);
+            ``findings`` and report say by how much. None, the default, leaves them as they are. It needs
+            ``candidate="auto"``.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
@@ -97,6 +107,8 @@ class OfflineMPCLearner:
         preset: The name of the preset; None where a method was given.
         candidate: As given.
         polish: As given.
+        soften: As given.
+        keep_limits: As given.
         candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
             where the method knows of none but the whole fit.
     """
@@ -110,6 +122,8 @@ class OfflineMPCLearner:
         *,
         candidate: str = "auto",
         polish: bool = False,
+        soften: Soften | None = None,
+        keep_limits: float | None = None,
         method: str | Method | None = None,
         value: str | ValueMethod | None = None,
         value_function: ValueFunction | None = None,
@@ -117,7 +131,7 @@ class OfflineMPCLearner:
         **options: Any,
     ) -> None:
         if not isinstance(learn, str) or learn not in _GROUPS:
-            raise InvalidArgumentError("learn", expected="'cost' or 'cost+model'", actual=repr(learn))
+            raise InvalidArgumentError("learn", expected=" or ".join(map(repr, _GROUPS)), actual=repr(learn))
         check_known("preset", preset, PRESETS)
         if method is not None and preset != "default":
             expected = "none beside a method: a preset names its own"
@@ -137,6 +151,12 @@ class OfflineMPCLearner:
         self.method = method.replaced(options)
         self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
         self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
+        if keep_limits is not None:
+            check_number("keep_limits", keep_limits, 0.0, 1.0)
+            if candidate != "auto":
+                raise InvalidArgumentError("candidate", expected="'auto' with keep_limits", actual=repr(candidate))
+        self.soften, self.keep_limits = check_soften(soften), keep_limits
+        self.softening: Softening | None = None
         self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
@@ -172,7 +192,8 @@ class OfflineMPCLearner:
         if not isinstance(self._mpc, MPC):
             return ()
         chosen = () if self.candidates is None else (self.candidates.finding,)
-        return (*findings(self.nominal_mpc, self._mpc, self.result), *chosen)
+        soft = softening_found(self.nominal_mpc, self._mpc)
+        return (*findings(self.nominal_mpc, self._mpc, self.result), *soft, *chosen)
 
     def fit(
         self,
@@ -254,6 +275,7 @@ class OfflineMPCLearner:
         for finding in report.warnings:
             logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
+        self.softening = Softening.of(self.nominal_mpc, table, self.seed) if self.soften else None
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
         history: History = [] if saved is None else saved.resume(run)
@@ -263,7 +285,7 @@ class OfflineMPCLearner:
                     ending.callback(end)
             for epoch in run.epochs(n_steps_per_epoch):
                 self.value_function, self.result = run.value_function, run.result
-                self._mpc, self._policy, self._observation_space = run.learned, None, observation_space
+                self._mpc, self._policy, self._observation_space = self._ready(run), None, observation_space
                 metrics = dict(epoch.metrics)
                 if run.learned is not None:
                     metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
@@ -295,6 +317,11 @@ class OfflineMPCLearner:
                 "learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset)."
             )
         return found
+
+    def _ready(self, run: Run) -> Callable[[], MPC] | None:
+        """How to find the MPC that a run would hand out now; None before the last stage that takes steps."""
+        learned, soft = run.learned, self.softening
+        return learned if learned is None or soft is None else lambda: soft(learned())
 
     def _found(self) -> MPC | None:
         """The MPC; while fitting, its cost and its terminal cost take some seconds, once an epoch."""
@@ -334,28 +361,7 @@ class OfflineMPCLearner:
                 registered; nothing is written then.
             StorageError: If it cannot be written.
         """
-        space = self._observation_space
-        document = {
-            "nominal": self.nominal_mpc.to_json(),
-            "learned": None if self._mpc is None else self.mpc.to_json(),
-            "learn": self.learn,
-            "preset": self.preset,
-            "method": self.method.name,
-            "options": self.method.to_json(),
-            "value_given": self._given_value_function is not None,
-            "seed": self.seed,
-            "device": self.device,
-            "history": self.history,
-            "result": None if self.result is None else self.result.to_json(),
-            "candidate": self.candidate,
-            "polish": self.polish,
-            "candidates": None if self.candidates is None else self.candidates.to_json(),
-            "observation_space": None if space is None else box_to_json(space),
-        }
-        arrays = {} if self.value_function is None else self.value_function.to_arrays()
-        if self.candidates is not None:
-            arrays |= self.candidates.to_arrays()
-        write_archive(path, "learner", document, arrays)
+        write_learner(self, path)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> OfflineMPCLearner:
@@ -365,34 +371,7 @@ class OfflineMPCLearner:
             FileFormatError: If the file is damaged, foreign, of another version, or of a learning method that is not
                 known here.
         """
-        document, arrays = read_archive(path, "learner")
-        method = METHODS.of_file(document.get("method"), str(path))
-        with file_errors(path):
-            nominal = MPC.from_json(document["nominal"])
-            how = method.from_json(document["options"])
-            learner = cls(nominal, document["learn"], seed=document["seed"], method=how, device=document["device"])
-            if document["preset"] is not None:
-                learner.preset = check_name("preset", document["preset"], error=FileFormatError)
-            learner.history = history_from_json(document["history"])
-            if document["learned"] is not None:
-                learner._mpc = MPC.from_json(document["learned"])
-            learner.candidate = check_name("candidate", document["candidate"], error=FileFormatError)
-            learner.polish = document["polish"] is True
-            if document["candidates"] is not None:
-                learner.candidates = Candidates.from_files(document["candidates"], arrays)
-            if document["result"] is not None:
-                whole = learner.mpc if learner.candidates is None else learner.candidates[FULL]
-                learner.result = FitResult.from_json(document["result"], whole.theta)
-            if document["observation_space"] is not None:
-                learner._observation_space = box_from_json(document["observation_space"])
-            arrays = {name: array for name, array in arrays.items() if not name.startswith(TRIALS)}
-            if arrays:
-                learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
-                if document["value_given"]:
-                    learner._given_value_function = learner.value_function
-                if learner.value_function.ny not in (nominal.nx, (learner.mpc if document["learned"] else nominal).nx):
-                    raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
-        return learner
+        return read_learner(cls, path)
 
 
 def _asks_to_end(answer: Any) -> bool:

@@ -16,6 +16,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification
 from mpcoffline.mpc import MPC
 
+from .limit_costs import LimitCosts
 from .potential import Potential
 from .value.function import ValueFunction
 
@@ -37,6 +38,8 @@ class FitResult:
         residual_share: The share of what the identified model missed that a learned residual explains; None where the
             model has none.
         cost: How the logged costs follow from the MPC's stage cost, where that was kept; None where it was learned.
+        limits: What a unit of the prices of soft limits is in logged costs, and whether these contain them; None where
+            nothing is soft.
     """
 
     theta: NDArray[np.float64]
@@ -46,6 +49,7 @@ class FitResult:
     potential: Potential | None = None
     residual_share: float | None = None
     cost: KnownCost | None = None
+    limits: tuple[float, bool] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description, without theta."""
@@ -56,6 +60,7 @@ class FitResult:
             "potential": None if self.potential is None else self.potential.to_json(),
             "residual_share": self.residual_share,
             "cost": None if self.cost is None else asdict(self.cost),
+            "limits": None if self.limits is None else list(self.limits),
         }
 
     @classmethod
@@ -65,7 +70,9 @@ class FitResult:
         at_bounds = tuple(map(str, data["at_bounds"]))
         share = None if data["residual_share"] is None else float(data["residual_share"])
         cost = None if data["cost"] is None else KnownCost.from_json(data["cost"])
-        return cls(theta, float(data["loss_before"]), float(data["loss_after"]), at_bounds, potential, share, cost)
+        limits = None if data["limits"] is None else (float(data["limits"][0]), data["limits"][1] is True)
+        losses = float(data["loss_before"]), float(data["loss_after"])
+        return cls(theta, *losses, at_bounds, potential, share, cost, limits)
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,8 @@ class Known:
         device: Torch device for what is large.
         value_function: V_phi, given or learned; None before.
         cost: How the logged costs follow from the MPC's stage cost, which then is not learned; None where it is.
+        limits: What the soft limits cost in logged costs, of which the table's do not contain it; None where nothing is
+            soft.
         model_error: What the model misses in one step, as share of an increment (root mean square); None where it was
             not identified.
         residual_share: The share of what the identified model missed that a learned residual explains; None where the
@@ -133,6 +142,7 @@ class Known:
     device: str = "cpu"
     value_function: ValueFunction | None = None
     cost: KnownCost | None = None
+    limits: LimitCosts | None = None
     model_error: float | None = None
     residual_share: float | None = None
     result: FitResult | None = None

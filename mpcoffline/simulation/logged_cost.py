@@ -9,6 +9,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning.known_cost import COST_ROWS, ROUNDING, agreeing_cost, as_applied
+from mpcoffline.learning.known_limits import limit_costs_of
 from mpcoffline.learning.stages import KnownCost
 from mpcoffline.mpc import MPC
 
@@ -27,13 +28,15 @@ class LoggedCost:
     quadratic and a small network (:func:`~mpcoffline.simulation.cost_regression.cost_regressions`), of the
     rows as they were logged: with smoothed ones a regulated plant's cost looks like that of another plant. Rows that
     end an episode are no part of it; what an end costs is learned by itself. ``L -> a L + b`` changes all costs
-    likewise and nothing else. Where L depends on s+, this is its mean given (s, a).
+    likewise and nothing else. Where L depends on s+, this is its mean given (s, a). What the MPC's soft limits cost is
+    added as it is written, whether the logged costs contain it or not
+    (:func:`~mpcoffline.learning.known_limits.limit_costs_of`).
 
     Args:
         table: The transitions.
         seed: Seeds the split and the weights.
         seen: How many coordinates of s the cost may depend on, the first ones; all by default.
-        mpc: Its stage cost may be the logged one.
+        mpc: Its stage cost may be the logged one; its soft limits cost what they say.
         logged: The transitions as they were logged, where ``table`` is smoothed.
 
     Attributes:
@@ -43,6 +46,7 @@ class LoggedCost:
         r2_second: The same of the second regression.
         exact: Whether the MPC's stage cost or a quadratic is exact.
         low: The cheapest logged cost.
+        limits: What the soft limits cost; None where nothing is soft.
         ends: Where episodes end, and at what price.
     """
 
@@ -56,6 +60,8 @@ class LoggedCost:
         logged: TransitionTable | None = None,
     ) -> None:
         table = table if logged is None else logged
+        self.limits = None if mpc is None else limit_costs_of(mpc, excerpt(table, COST_ROWS, seed))
+        table = table if self.limits is None else self.limits.without(table)
         self._seen = table.ny if seen is None else seen
         agreeing = None if mpc is None else _agreeing(mpc, excerpt(table, COST_ROWS, seed))
         self._partly = agreeing
@@ -74,11 +80,15 @@ class LoggedCost:
         self.r2_second = 1.0 - self._other.error
         self.exact = self.known is not None or self._regressions[0].exact
         last = table.take(np.flatnonzero(over)).values()
-        prices = last.costs - self(last.observations, last.actions)
+        prices = last.costs - self._stage(last.observations, last.actions)
         self.ends = learned_ends(table, prices, seed, self._seen)
 
     def __call__(self, s: Array, a: Array) -> Array:
         """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``; the dearest logged cost where it is no number."""
+        return self._with_limits(self._stage(s, a), s, a)
+
+    def _stage(self, s: Array, a: Array) -> Array:
+        """The same without the prices of soft limits."""
         if self._mpc is None or self.known is None:
             return self._regressions[0](np.hstack([s[:, : self._seen], a]))
         ours = self._mpc.stage_function(s.T, a.T, self._mpc.theta).full().ravel()
@@ -92,7 +102,10 @@ class LoggedCost:
         """
         if self.exact and (self.known is None or self.known.missed <= ROUNDING):
             return self(s, a)
-        return self._other(np.hstack([s[:, : self._seen], a]))
+        return self._with_limits(self._other(np.hstack([s[:, : self._seen], a])), s, a)
+
+    def _with_limits(self, cost: Array, s: Array, a: Array) -> Array:
+        return cost if self.limits is None else cost + self.limits(s, a)
 
     def as_applied(self, table: TransitionTable) -> NDArray[np.bool_]:
         """In which rows of a table the plant took the logged input, as far as the costs tell, ``(n,)``.
@@ -101,7 +114,8 @@ class LoggedCost:
         """
         if self._partly is None:
             return np.ones(len(table), dtype=bool)
-        return as_applied(self._partly[0], table, self._partly[1])
+        rows = table if self.limits is None else self.limits.without(table)
+        return as_applied(self._partly[0], rows, self._partly[1])
 
     def ended(self, s: Array, a: Array, reached: Array) -> NDArray[np.bool_]:
         """Whether steps from s ``(B, nx)`` under a ``(B, nu)`` to ``reached`` end an episode, ``(B,)``.
@@ -128,6 +142,8 @@ class LoggedCost:
                 f" explains {_share(self.r2)} on held-out episodes ({self._other.name} beside it, as a check,"
                 f" {_share(self.r2_second)})"
             )
+        if self.limits is not None:
+            said += f", and {self.limits.scale:.3g} times the prices of soft limits"
         return f"Costs in simulations: {said}; {self.ends}." if self.ends.count else f"Costs in simulations: {said}."
 
     def _columns(self, table: TransitionTable) -> tuple[Array, Array]:

@@ -223,13 +223,14 @@ class Surroundings:
         self.disturbances = models.replayed(table, rows, n_steps, cost.as_applied)
         rng = np.random.default_rng([seed, _NOISE])
         self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
-        self.returns = returns_along(table, rows, n_steps) + self.before
+        paid = table if cost.limits is None else cost.limits.whole(table)
+        self.returns = returns_along(paid, rows, n_steps) + self.before
         self.begun = np.isin(rows, table.episodes.firsts)
         states = columns.observations
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
         self._reach = np.where((spread > 0.0) & (np.arange(len(reach)) < layout.n_states), reach, np.inf)
-        self._dearest = float(columns.costs.max())
+        self._dearest = float((columns if paid is table else paid.values()).costs.max())
 
     def on(self, models: NDArray[np.intp]) -> Surroundings:
         """The same with some of the models, by number."""

@@ -34,7 +34,7 @@ class PlantFile:
     Attributes:
         name: Name of the plant: its file's, without ``.py``.
         module: What the file defines: ``DT``, ``STEPS``, ``DISCOUNT``, ``N_EPISODES``, ``Plant``, ``behaviour``,
-            ``mpc``, ``truth``, perhaps ``LEARN``.
+            ``mpc``, ``truth``, perhaps ``LEARN``; its ``Plant`` perhaps ``violations``.
     """
 
     name: str
@@ -112,6 +112,7 @@ class PlantFile:
         plants, observations = [plant for plant, _ in started], [observation for _, observation in started]
         act = self._behaviours(seed, n_starts) if controller is None else _Batched(controller)
         cost, running = np.zeros(n_starts), np.arange(n_starts)
+        over, steps = np.zeros(n_starts), np.zeros(n_starts)
         for k in range(self.module.STEPS):
             actions = act(np.stack([observations[e] for e in running]), running, k)
             goes_on = np.ones(len(running), dtype=bool)
@@ -119,10 +120,11 @@ class PlantFile:
                 reached, stage_cost, ended = plants[e].step(np.asarray(actions[i], np.float64))
                 observations[e], goes_on[i] = np.asarray(reached, np.float64), not ended
                 cost[e] += stage_cost
+                over[e], steps[e] = over[e] + _violates(plants[e]), steps[e] + 1
             running = running[goes_on]
             if not len(running):
                 break
-        return Loops(cost, np.array([bool(plant.success()) for plant in plants]))
+        return Loops(cost, np.array([bool(plant.success()) for plant in plants]), over / np.maximum(steps, 1))
 
     def _started(self, rng: np.random.Generator) -> tuple[Any, Array]:
         plant = self.module.Plant()
@@ -141,10 +143,23 @@ Act = Callable[[Array, NDArray[np.int_], int], Array]
 
 
 class Loops(NamedTuple):
-    """Closed loops: the cost of each episode ``(n,)``, and whether it ended well ``(n,)``."""
+    """Closed loops.
+
+    Attributes:
+        cost: Of each episode, ``(n,)``.
+        success: Whether it ended well, ``(n,)``.
+        violated: In which share of its steps it violated a limit, ``(n,)``; NaN where the plant has none.
+    """
 
     cost: Array
     success: NDArray[np.bool_]
+    violated: Array
+
+
+def _violates(plant: Any) -> float:
+    """Whether the step before violated a limit; NaN where the plant has none."""
+    violations = getattr(plant, "violations", None)
+    return float("nan") if violations is None else float(any(amount > 0.0 for amount in violations().values()))
 
 
 class _Batched:

@@ -70,6 +70,11 @@ class Outcome:
         ends_mpc_1: The same of MPC_1.
         ends_yardstick: The same of the yardstick.
         ends_learned: The same of the learned MPC.
+        over_mpc_1: Share of the steps in which MPC_1 violates a limit; NaN where the plant has none.
+        over_yardstick: The same of the yardstick.
+        over_learned: The same of the learned MPC.
+        more_over: over_learned - over_mpc_1, start by start.
+        more_over_error: Its standard error.
         fit_s: Time of the fit in s of one core.
         build_s: Time to build the learned MPC's solver, its compiler included, likewise.
         candidate: What the learner handed out, by name; empty where it had one candidate alone.
@@ -111,6 +116,11 @@ class Outcome:
     ends_mpc_1: float = NAN
     ends_yardstick: float = NAN
     ends_learned: float = NAN
+    over_mpc_1: float = NAN
+    over_yardstick: float = NAN
+    over_learned: float = NAN
+    more_over: float = NAN
+    more_over_error: float = NAN
     fit_s: float = NAN
     build_s: float = NAN
     candidate: str = ""
@@ -176,6 +186,11 @@ class Outcome:
         return self.full_over_behaviour > MARGIN * abs(self.behaviour)
 
     @property
+    def violates_more(self) -> bool:
+        """Whether the learned MPC violates limits in more steps than MPC_1, beyond two standard errors."""
+        return self.more_over > 2.0 * self.more_over_error
+
+    @property
     def room(self) -> bool:
         """Whether the yardstick costs less than MPC_1, by more than 2 %."""
         return self.yardstick < self.mpc_1 - MARGIN * abs(self.mpc_1)
@@ -208,6 +223,8 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
         done = plant.closed_loops(controller, seed, n)
         column = name.lower()
         found[column], found[f"ends_{column}"] = float(done.cost.mean()), float(done.success.mean())
+        if controller is not None:
+            found[f"over_{column}"] = float(done.violated.mean())
         return done
 
     today = loops("behaviour", None)
@@ -231,6 +248,7 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
     found["build_s"] = _core_seconds() - start
     learned = loops("learned", learner.policy)
     found["gain"], found["gain_error"] = paired(learned.cost, first.cost)
+    found["more_over"], found["more_over_error"] = paired(learned.violated, first.violated)
     found["over_behaviour"], found["over_behaviour_error"] = paired(learned.cost, today.cost)
     if best is not None:
         found["short"], found["short_error"] = paired(learned.cost, best.cost)

@@ -46,6 +46,7 @@ def summarised(outcomes: Sequence[Outcome]) -> Summary:
 _HEADER = ["plant", "seed", "behaviour", "MPC_1", "yardstick", "learned", "learned - MPC_1", "learned - yardstick"]
 _HEADER += ["ends well: MPC_1/yardstick/learned", "fit (s)", "build (s)", "learned - behaviour", "handed out"]
 _HEADER += ["full - MPC_1"]
+_OF_LIMITS = ["steps that violate a limit: MPC_1/yardstick/learned", "learned - MPC_1"]
 _OF_VERDICT = ["from the log's starts", "expected", "verdict", "verdict on full"]
 
 
@@ -71,13 +72,32 @@ def report(outcomes: Sequence[Outcome]) -> str:
         f" build of its solver {_range([o.build_s for o in rows])}",
     ]
     lines += _of_choice(done := [o for o in rows if not o.error]) + _of_verdicts([o for o in done if o.verdict])
+    lines += _of_limits(limited := [o for o in rows if not np.isnan(o.over_learned)])
     lines += [f"* Failed: {o.plant} {o.seed}: {o.error}" for o in failed]
     judged = any(o.verdict for o in rows)
-    header = _HEADER + _OF_VERDICT * judged
-    cells = [_cells(o) + _verdict_cells(o) * judged for o in rows]
-    table = Table(header, cells, align="lrrrrrrrrrrrlr" + "rrll" * judged)
+    has_limits = bool(limited)
+    header = _HEADER + _OF_LIMITS * has_limits + _OF_VERDICT * judged
+    cells = [_cells(o) + _limit_cells(o) * has_limits + _verdict_cells(o) * judged for o in rows]
+    table = Table(header, cells, align="lrrrrrrrrrrrlr" + "rr" * has_limits + "rrll" * judged)
     lines += ["", table.markdown(), "", *_sayings(rows)]
     return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _of_limits(rows: Sequence[Outcome]) -> list[str]:
+    """Violations of what was handed out, of the plants that have limits."""
+    if not rows:
+        return []
+    more = [o for o in rows if o.violates_more]
+    return [
+        f"* Violates limits in more steps than MPC_1, beyond two standard errors: **{len(more)} of {len(rows)}** with"
+        f" limits{_names(more)}"
+    ]
+
+
+def _limit_cells(o: Outcome) -> list[str]:
+    shares = [o.over_mpc_1, o.over_yardstick, o.over_learned]
+    told = "/".join("-" if np.isnan(share) else f"{share:.1%}" for share in shares)
+    return [told, "-" if np.isnan(o.more_over) else f"{100 * o.more_over:+.2g} +- {100 * o.more_over_error:.2g} %"]
 
 
 def _of_choice(rows: Sequence[Outcome]) -> list[str]:

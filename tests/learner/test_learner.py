@@ -289,7 +289,7 @@ def test_the_preset_is_the_default_one() -> None:
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"learn": "model"}, InvalidArgumentError, r"learn: expected 'cost' or 'cost\+model', got 'model'"),
+        ({"learn": "model"}, InvalidArgumentError, r"learn: expected 'cost' or 'cost\+model' or .*, got 'model'"),
         ({"preset": "papr"}, UnknownIdError, "Did you mean 'paper'"),
         ({"value": "expectil"}, UnknownIdError, "Did you mean 'expectile'"),
         ({"priors": 1.0}, UnknownIdError, "option of the learning method Bellman: .*Did you mean 'prior'"),

@@ -90,3 +90,26 @@ def test_the_earlier_folder_wins(tmp_path: Path) -> None:
     assert found == {"cart": tmp_path / "a" / "cart.py", "tank": tmp_path / "b" / "plants" / "tank.py"}
     with pytest.raises(StorageError, match="plant files"):
         find_plant_files([tmp_path / "nowhere"])
+
+
+def test_violations_are_counted_step_by_step(plant: PlantFile, tmp_path: Path) -> None:
+    """A share of the steps that each episode had; NaN where the plant has no limits."""
+    policy, seed, n = MPCPolicy(plant.module.mpc(0)), 1, 12
+    assert np.isnan(plant.closed_loops(policy, seed, n).violated).all()
+    said = "    def violations(self):\n        return {'room': self.x - 0.4, 'never': -1.0}\n\n    def success"
+    path = tmp_path / "limited.py"
+    path.write_text(TEXT.replace("    def success", said))
+    found = PlantFile.load(path).closed_loops(policy, seed, n)
+    shares = []
+    for e in range(n):
+        one, state, over = plant.module.Plant(), None, []
+        y = one.reset(np.random.default_rng([900 + seed, e]))
+        for k in range(plant.module.STEPS):
+            u, state = policy.predict(y, state=state, episode_start=np.array([k == 0]))
+            y, _, ended = one.step(u)
+            over.append(one.x > 0.4)
+            if ended:
+                break
+        shares.append(np.mean(over))
+    np.testing.assert_allclose(found.violated, shares)
+    assert 0.0 < found.violated.mean() < 1.0

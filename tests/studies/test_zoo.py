@@ -120,6 +120,19 @@ def test_counts_know_no_sign_of_the_cost() -> None:
     assert "Failed: cart 6: x" in page
 
 
+def test_violations_have_their_columns_and_counts() -> None:
+    """Only where a plant has limits."""
+    assert "limit" not in zoo_page.report([outcome(100.0, 90.0)])
+    limits: dict[str, Any] = {"over_mpc_1": 0.02, "over_yardstick": 0.0, "more_over_error": 0.004}
+    more = outcome(100.0, 90.0, seed=1, over_learned=0.03, more_over=0.01, **limits)
+    fewer = outcome(100.0, 90.0, seed=2, over_learned=0.01, more_over=-0.01, **limits)
+    unsure = outcome(100.0, 90.0, seed=3, over_learned=0.025, more_over=0.005, **limits)
+    page = zoo_page.report([more, fewer, unsure, outcome(100.0, 90.0, seed=4)])
+    assert "beyond two standard errors: **1 of 3** with limits (cart 1)" in page
+    assert "| 2.0%/0.0%/3.0% | +1 +- 0.4 % |" in page
+    assert "| -/-/- | - |" in page
+
+
 def test_verdicts_are_counted_against_the_truth() -> None:
     def judged(learned: float, full: float, seed: int, verdict: str, full_verdict: str, **more: Any) -> Outcome:
         known = {

@@ -11,7 +11,7 @@ from mpcoffline.learning.known_cost import as_logged
 from mpcoffline.learning.stages import Known
 from mpcoffline.mpc import MPC
 
-from .stages import TerminalConfig, in_units_of, with_terminal_cost
+from .stages import TerminalConfig, in_units_of, repriced_as_logged, with_terminal_cost
 
 _log = logging.getLogger(__name__)
 
@@ -50,13 +50,14 @@ def candidates(
     found = {"identified": plain, "identified, farther": farther}  # which may be the same
     if known.cost is not None:
         return found
-    alike = in_units_of(plain, known.table)
+    alike = repriced_as_logged(in_units_of(plain, known.table), known)
     fitted = {"fitted cost": alike.replace(model=full.model, stage_cost=full.stage_cost)}
     if only_fitted:
         return fitted
     if terminal.method != "given" and known.value_function is not None:
         result = None if known.result is None else dataclasses.replace(known.result, potential=None)
-        start = dataclasses.replace(known, mpc=in_units_of(farther, known.table), result=result)
+        alike = repriced_as_logged(in_units_of(farther, known.table), known)
+        start = dataclasses.replace(known, mpc=alike, result=result)
         fitted["identified, V"] = with_terminal_cost(start, terminal).mpc
     return found | fitted
 

@@ -9,12 +9,14 @@ from functools import partial
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.estimation import with_profiles
 from mpcoffline.learning.known_cost import CostConfig, with_known_cost
+from mpcoffline.learning.known_limits import with_limit_costs
 from mpcoffline.learning.method import METHODS, Method
 from mpcoffline.learning.stages import Change, Known, Stage
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.mpc import MPC
 
 from .candidates import candidates, with_learned_residual
+from .limits import check_limit_parameters
 from .regression import ParameterConfig
 from .stages import (
     LearnParameters,
@@ -32,9 +34,10 @@ from .stages import (
 class Bellman(Method):
     """The regressions of arXiv:2301.01667 one after the other; no MPC is solved.
 
-    In this order: whether the stage cost is known, dead time of the inputs, identification of the model and removal of
-    measurement noise (the last three with ``init="identified"``), V_phi by (VALUE), theta by (FIT), the terminal cost
-    from V. By default all are as in :class:`~mpcoffline.learning.Paper`.
+    In this order: what soft limits cost, which V sees and (FIT) need not explain; whether the stage cost is known, dead
+    time of the inputs, identification of the model and removal of measurement noise (the last three with
+    ``init="identified"``), V_phi by (VALUE), theta by (FIT), the terminal cost from V. By default all are as in
+    :class:`~mpcoffline.learning.Paper`.
 
     Attributes:
         cost: Whether the stage cost is learned.
@@ -61,7 +64,13 @@ class Bellman(Method):
             )
 
     def prepared(self, known: Known) -> Known:
-        """Profiles of signals; and dead time of the inputs, found in the data or checked (``init="identified"``)."""
+        """Profiles of signals; and dead time of the inputs, found in the data or checked (``init="identified"``).
+
+        Raises:
+            InvalidArgumentError: If limits are to be learned, and none of them can.
+        """
+        if "constraints" in known.groups:
+            check_limit_parameters(known.mpc)
         return with_dead_time(replace(known, mpc=with_profiles(known.mpc, known.table)), self.identify)
 
     def candidates(self, known: Known) -> dict[str, MPC]:
@@ -76,6 +85,7 @@ class Bellman(Method):
     def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""
         return {
+            "limits": with_limit_costs,
             "cost": partial(with_known_cost, config=self.cost),
             "identify": partial(identified, config=self.identify),
             "value": LearnValue(self.value),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from mpcoffline.core.text import listed
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning.adam import STATE, Adam
+from mpcoffline.learning.limit_costs import LimitCosts
 from mpcoffline.learning.stages import FitResult, KnownCost, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
@@ -23,6 +24,7 @@ from mpcoffline.mpc.coordinates import Coordinates, canonical
 from mpcoffline.mpc.scaling import Scaling, cost_spread, increments_scale
 
 from .equation import BellmanProblem, PredictionError
+from .limits import refit_limits
 from .refit import refit_cost
 
 _log = logging.getLogger(__name__)
@@ -84,6 +86,8 @@ class ParameterTraining:
         config: Prior and schedules.
         seed: Seeds the minibatches.
         cost: How the logged costs follow from the MPC's, where that is known: then the stage cost stays.
+        limits: What soft limits cost, which the table does not contain; their parameters are learned where ``groups``
+            have ``"constraints"``.
 
     Raises:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
@@ -99,9 +103,11 @@ class ParameterTraining:
         *,
         seed: int,
         cost: KnownCost | None = None,
+        limits: LimitCosts | None = None,
     ) -> None:
         self._groups = groups = groups if cost is None else tuple(group for group in groups if group != "cost")
         self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
+        self._limits = limits if "constraints" in groups else None
         costs = table.costs
         self._rng = np.random.default_rng(seed)
         self._problem = BellmanProblem(mpc, value, cost_spread(costs), cost)
@@ -206,7 +212,7 @@ class ParameterTraining:
     def result(self) -> FitResult:
         """The convex fit of the cost from where the gradient steps are; theta_0's model where they all failed."""
         if self._result is None:
-            self._result = self._finished()
+            self._result = self._with_limits(self._finished())
         return self._result
 
     def _finished(self) -> FitResult:
@@ -234,6 +240,14 @@ class ParameterTraining:
         if at_bounds:
             _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", listed(at_bounds))
         return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
+
+    def _with_limits(self, found: FitResult) -> FitResult:
+        """The result with the parameters of limits, where these are learned."""
+        if self._limits is None:
+            return found
+        how = self._mpc, found.theta, self._problem, self._sample, self._limits
+        theta, error = refit_limits(*how, prior=self.config.prior)
+        return replace(found, theta=theta, loss_after=error)
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         """What :meth:`restore` needs to go on bit for bit."""

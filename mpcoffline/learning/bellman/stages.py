@@ -24,6 +24,7 @@ from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.learning.value.training import ValueTraining
 from mpcoffline.mpc import MPC, NormCost, TerminalCost
+from mpcoffline.mpc.penalties import repriced
 
 from .regression import ParameterConfig, ParameterTraining
 
@@ -118,7 +119,8 @@ class LearnValue(Stage):
         """See :class:`~mpcoffline.learning.value.training.ValueTraining`."""
         if known.value_function is not None:
             return None
-        return ValueTraining(known.table, known.mpc.discount, self._config, seed=known.seed, device=known.device)
+        table = known.table if known.limits is None else known.limits.added(known.table)
+        return ValueTraining(table, known.mpc.discount, self._config, seed=known.seed, device=known.device)
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds V_phi."""
@@ -143,7 +145,9 @@ class LearnParameters(Stage):
         value, config, table = known.constant_value, self._adapting(known), known.table
         if known.cost is None and ends_matter(table, mpc.discount):  # of which T knows; no stage cost explains them
             table = table.take(np.flatnonzero(np.asarray(table.terminations) == 0.0))
-        return ParameterTraining(mpc, value, table, known.groups, config, seed=known.seed, cost=known.cost)
+        return ParameterTraining(
+            mpc, value, table, known.groups, config, seed=known.seed, cost=known.cost, limits=known.limits
+        )
 
     def _adapting(self, known: Known) -> ParameterConfig:
         """The configuration, without steps on a model that was identified and predicts well, or has the right cost."""
@@ -165,8 +169,10 @@ class LearnParameters(Stage):
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds theta and the result."""
-        result = replace(training.result, residual_share=known.residual_share, cost=known.cost)
-        return replace(known, mpc=known.mpc.with_theta(result.theta), result=result)
+        limits = None if known.limits is None else (known.limits.scale, known.limits.logged)
+        result = replace(training.result, residual_share=known.residual_share, cost=known.cost, limits=limits)
+        mpc = repriced_as_logged(known.mpc, known)
+        return replace(known, mpc=mpc.with_theta(result.theta), result=result)
 
 
 @dataclass(frozen=True)
@@ -241,6 +247,11 @@ def _ends(known: Known, potential: Potential | None) -> tuple[Array, Array] | No
         return None
     shaping = 0.0 if potential is None else potential(torch.from_numpy(ends.before)).numpy() / known.mpc.discount
     return ends.states, np.asarray(ends.values - shaping)
+
+
+def repriced_as_logged(mpc: MPC, known: Known) -> MPC:
+    """The MPC with the prices of its soft limits in logged costs, where its stage cost is learned from these."""
+    return mpc if known.limits is None or known.cost is not None else repriced(mpc, known.limits.scale)
 
 
 def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:

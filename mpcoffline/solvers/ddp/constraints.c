@@ -9,6 +9,7 @@
 #define STUCK 2.0            /* times in a row: then its square */
 #define LARGEST_WEIGHT 1e7   /* times the first: a hard limit that is not near its solution then, cannot be kept */
 #define UNAFFORDABLE 30.0    /* times all other costs there and what candidates differ by: no more is paid for hard limits */
+#define STILL_OPEN 0.05      /* of what is paid for hard limits: what promises more when it is cut short, was not done */
 #define FEW_INNER 12         /* iterations of a minimisation in which those that are stuck cost more than all else */
 #define RELAXED 10.0         /* what a weight falls by from plan to plan, at least, */
 #define STIFF 100.0          /* to no more than this times the first one: stiffer problems are slow */
@@ -204,6 +205,8 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
     vl told = ended & ~near & vd_lt(V(1.0), c->dominated);
     vd paid = paid_for_hard(m, w), others = w->size - vd_abs(paid);
     vl dear = vd_lt(UNAFFORDABLE * (others + spread_of_costs(m, c)), paid);
+    /* A minimisation that is cut short while it may still be rid of what it pays, tells nothing of its limits. */
+    vl open = capped & vd_lt(STILL_OPEN * paid, w->predicted);
     vl through = ended & near & vd_le(c->tolerance, V(m->tolerance)) & ~capped;
     vl go_on = ended & ~through;
     for (int64_t k = 0; k <= m->horizon; ++k)
@@ -214,10 +217,10 @@ static vl tighten(const mpc_problem *m, lanes *w, vl *converged, vl *stalled) {
     for (int j = 0; j < LIMITS; ++j) {
         vl slow = go_on & vd_lt(V(FEASIBLE), off[j]) & vd_lt(c->before[j] / CLOSER, off[j]);
         c->stuck[j] = vd_select(go_on, vd_select(slow, c->stuck[j] + 1.0, V(0.0)), c->stuck[j]);
-        vl often = vd_le(V(STUCK), c->stuck[j]);
+        vl often = vd_le(V(STUCK), c->stuck[j]) & ~open;
         if (!(limit_l1[j] < INFINITY)) {
             held |= often;
-            lost |= slow & ((often & dear) | vd_lt(LARGEST_WEIGHT * c->first_rho[j], c->rho[j]));
+            lost |= slow & ~open & ((often & dear) | vd_lt(LARGEST_WEIGHT * c->first_rho[j], c->rho[j]));
         }
         vd more = vd_select(often, V(GROWTH * GROWTH), V(GROWTH)) * c->rho[j];
         c->rho[j] = vd_select(slow & ~told & (often | ~capped), more, c->rho[j]);

@@ -198,7 +198,8 @@ static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
     for (int i = 0; i < MPC_HORIZON * NU; ++i) w->u[i] = clip(state->u[i], low[i % NU], high[i % NU]);
     for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w->x[i] = i < NX ? w->s[i] : state->x[i];
 #if LIMITS
-    if (!state->has_limits) {
+    int was_lost = !state->has_limits;
+    if (was_lost) {
         keep(state->old_x, state->old_u, w->x, w->u);
         first_limits(m, state, w);
         keep(w->x, w->u, state->old_x, state->old_u);
@@ -218,6 +219,10 @@ static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
     }
 #if LIMITS
     double violation = w->c.violation;
+    if (was_lost && status == INFEASIBLE) { /* its plan was the best from all starts */
+        keep(state->x, state->u, w->x, w->u);
+        return 1;
+    }
 #endif
     if (found) keep(state->old_x, state->old_u, w->x, w->u);
     else keep(state->old_x, state->old_u, state->x, state->u);

@@ -30,6 +30,7 @@ from .rounding import Rounding
 # By the kernel's codes.
 _STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE, Status.INFEASIBLE)
 _LANES = 8
+_ITERATIONS, _LIMITED_ITERATIONS = 200, 500
 
 
 class _Problem(ctypes.Structure):
@@ -110,7 +111,8 @@ class DDPSolver(Solver):
 
     Args:
         mpc: The problem.
-        max_iterations: Bound on the iterations of a problem, with limits of all its minimisations together.
+        max_iterations: Bound on the iterations of a problem, with limits of all its minimisations together; by default
+            200, with limits 500.
         tolerance: Predicted decrease of the cost, relative to the magnitudes of its stages (their constants left out),
             below which a problem is solved; 1000 times as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
@@ -131,7 +133,7 @@ class DDPSolver(Solver):
         self,
         mpc: MPC,
         *,
-        max_iterations: int = 200,
+        max_iterations: int | None = None,
         tolerance: float = 1e-11,
         n_starts: int | None = None,
         n_threads: int = 1,
@@ -145,6 +147,8 @@ class DDPSolver(Solver):
             n_threads=n_threads,
             round_corners=round_corners,
         )
+        if max_iterations is None:
+            max_iterations = _ITERATIONS if mpc.constraints is None else _LIMITED_ITERATIONS
         check_options({"max_iterations": max_iterations, "tolerance": tolerance, "n_threads": n_threads})
         if n_starts is None:
             n_starts = 1 if is_convex(mpc) else 16
@@ -258,8 +262,10 @@ class DDPSolver(Solver):
         result = self._run(x, theta, u0, plan) if n_known == len(x) else self._run_mixed(x, theta, u0, plan, known)
         if not np.count_nonzero(result["status"]):
             return result
-        lost = known & (result["status"] > 1)
-        result["all_starts"] = ~known | lost
+        # A plan of a problem that could not be solved was the best from all starts; what is told again, is believed.
+        believed = self._was_lost(plan) & (result["status"] == _STATUS.index(Status.INFEASIBLE))
+        lost = known & (result["status"] > 1) & ~believed
+        result["all_starts"] = ~known | lost | believed
         if np.count_nonzero(lost):
             again = self._run(x[lost], _rows(theta, lost), None if u0 is None else u0[lost], None)
             # A plan that is not accepted either is only taken if it is better.
@@ -269,6 +275,12 @@ class DDPSolver(Solver):
             for name, array in again.items():
                 result[name][rows[taken]] = array[taken]
         return result
+
+    def _was_lost(self, plan: Plan) -> NDArray[np.bool_]:
+        """Which plans are of solves that failed: such have no multipliers, where others of the same solver do."""
+        if self._limited is None or plan.multipliers is None:
+            return np.zeros(len(plan.u), dtype=bool)
+        return self._limited.unknown(plan.multipliers)
 
     def _run_mixed(
         self, x: Array, theta: Array, u0: Array | None, plan: Plan, known: NDArray[np.bool_]

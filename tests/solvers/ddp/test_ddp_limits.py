@@ -12,6 +12,7 @@ import pytest
 from limited_problems import PROBLEMS, cart_pole, integrator
 from mpc_problems import simulated
 from numpy.typing import NDArray
+from random_limits import RandomProblem
 
 from mpcoffline import MPCPolicy
 from mpcoffline.core.errors import InvalidArgumentError
@@ -276,3 +277,35 @@ def test_what_cannot_be_kept_is_told_soon() -> None:
     iterations = solution.stats["iterations"]
     assert np.median(iterations[lost]) <= 10.0 * np.median(iterations[kept])
     assert iterations[lost].max() < 848  # all starts to their last iteration
+
+
+def test_what_was_cut_short_is_no_infeasibility() -> None:
+    """Between an obstacle and a bound the minimisations take hundreds of iterations; ipopt gets through."""
+    problem = RandomProblem(38)
+    unit, x = problem.units(), problem.states(10)[6]
+    ours, theirs = DDPSolver(problem.mpc(unit)).solve(unit.x * x), IpoptSolver(problem.mpc()).solve(x)
+    assert theirs.success
+    assert ours.success
+    assert ours.value / unit.cost == pytest.approx(float(theirs.value), rel=1e-4)
+
+
+def test_what_cannot_be_kept_is_not_solved_twice_from_plan_to_plan() -> None:
+    """A plan of all starts that violates what it must, is gone on from; the first time it is tried from all starts."""
+    mpc, start = double_integrator([StateBounds([-1.0, -9.0], [1.0, 9.0], "track")]), np.array([[6.0, 1.0]])
+    solver = DDPSolver(mpc, n_starts=16)
+    cold = solver.solve(start)
+    warm = solver.solve(cold.x[:, 1], warm_start=cold.plan.shifted())
+    again = solver.solve(cold.x[:, 1])
+    assert warm.status == again.status == ["infeasible"]
+    assert warm.stats["all_starts"].all()
+    assert warm.stats["iterations"][0] < 0.5 * again.stats["iterations"][0]
+    np.testing.assert_allclose(warm.stats["violation"], again.stats["violation"], rtol=1e-3)
+    policy = MPCPolicy(mpc, solver)
+    state = None
+    for _ in range(2):
+        _, state = policy.predict(start, state=state)
+    assert policy.solver_stats.answers == {"retried": 0, "rescued": 0, "best_plan": 2, "previous_plan": 0, "zero": 0}
+    free = solver.solve([[0.5, 0.0]])
+    assert free.success.all()
+    changed = solver.solve(cold.x[:, 1], warm_start=free.plan)  # of a problem that was solved: from all starts besides
+    assert changed.stats["iterations"][0] > again.stats["iterations"][0]

@@ -1,0 +1,82 @@
+"""The file of a learner: a zip of JSON and npz."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import TYPE_CHECKING
+
+from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.core.errors import FileFormatError
+from mpcoffline.core.text import check_name
+from mpcoffline.learning import METHODS, FitResult, ValueFunction
+from mpcoffline.mpc import MPC
+
+from .candidates import FULL, TRIALS, Candidates
+from .checkpoint import history_from_json
+from .softening import check_soften
+
+if TYPE_CHECKING:
+    from .learner import OfflineMPCLearner
+
+
+def write_learner(learner: OfflineMPCLearner, path: str | PathLike[str]) -> None:
+    """See :meth:`OfflineMPCLearner.save`."""
+    space = learner._observation_space
+    document = {
+        "nominal": learner.nominal_mpc.to_json(),
+        "learned": None if learner._mpc is None else learner.mpc.to_json(),
+        "learn": learner.learn,
+        "preset": learner.preset,
+        "method": learner.method.name,
+        "options": learner.method.to_json(),
+        "value_given": learner._given_value_function is not None,
+        "seed": learner.seed,
+        "device": learner.device,
+        "history": learner.history,
+        "result": None if learner.result is None else learner.result.to_json(),
+        "candidate": learner.candidate,
+        "polish": learner.polish,
+        "soften": learner.soften,
+        "keep_limits": learner.keep_limits,
+        "candidates": None if learner.candidates is None else learner.candidates.to_json(),
+        "observation_space": None if space is None else box_to_json(space),
+    }
+    arrays = {} if learner.value_function is None else learner.value_function.to_arrays()
+    if learner.candidates is not None:
+        arrays |= learner.candidates.to_arrays()
+    write_archive(path, "learner", document, arrays)
+
+
+def read_learner(cls: type[OfflineMPCLearner], path: str | PathLike[str]) -> OfflineMPCLearner:
+    """See :meth:`OfflineMPCLearner.load`."""
+    document, arrays = read_archive(path, "learner")
+    method = METHODS.of_file(document.get("method"), str(path))
+    with file_errors(path):
+        nominal = MPC.from_json(document["nominal"])
+        how = method.from_json(document["options"])
+        learner = cls(nominal, document["learn"], seed=document["seed"], method=how, device=document["device"])
+        if document["preset"] is not None:
+            learner.preset = check_name("preset", document["preset"], error=FileFormatError)
+        learner.history = history_from_json(document["history"])
+        if document["learned"] is not None:
+            learner._mpc = MPC.from_json(document["learned"])
+        learner.candidate = check_name("candidate", document["candidate"], error=FileFormatError)
+        learner.polish = document["polish"] is True
+        learner.soften = check_soften(document["soften"], FileFormatError)
+        if document["keep_limits"] is not None:
+            learner.keep_limits = float(document["keep_limits"])
+        if document["candidates"] is not None:
+            learner.candidates = Candidates.from_files(document["candidates"], arrays)
+        if document["result"] is not None:
+            whole = learner.mpc if learner.candidates is None else learner.candidates[FULL]
+            learner.result = FitResult.from_json(document["result"], whole.theta)
+        if document["observation_space"] is not None:
+            learner._observation_space = box_from_json(document["observation_space"])
+        arrays = {name: array for name, array in arrays.items() if not name.startswith(TRIALS)}
+        if arrays:
+            learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
+            if document["value_given"]:
+                learner._given_value_function = learner.value_function
+            if learner.value_function.ny not in (nominal.nx, (learner.mpc if document["learned"] else nominal).nx):
+                raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
+    return learner

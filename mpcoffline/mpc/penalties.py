@@ -1,0 +1,54 @@
+"""What the soft limits of a problem cost at a stage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+
+from .constraints import Constraint, Penalty, StateBounds
+from .problem import MPC
+
+
+def penalty_function(mpc: MPC) -> ca.Function | None:
+    """The sum over all soft limits along the horizon of ``l1 s + l2 s^2``, s = max(h, 0), at a stage.
+
+    Limits at the end of the horizon are no part of it, hard ones have no price.
+
+    Args:
+        mpc: The problem.
+
+    Returns:
+        A CasADi function ``(x, u, theta) -> price``; None where nothing along the horizon is soft.
+    """
+    x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
+    total, found = ca.SX(0), False
+    for soft, h in _limits(mpc, x, u, theta):
+        if soft is not None and h.numel():
+            over = ca.fmax(h, 0.0)
+            total, found = total + soft.l1 * ca.sum1(over) + soft.l2 * ca.sumsqr(over), True
+    return ca.Function("penalty", [x, u, theta], [ca.densify(total)]) if found else None
+
+
+def _limits(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> list[tuple[Penalty | None, ca.SX]]:
+    along = mpc.constraints_at("stages")
+    found = [(each.soft, ca.densify(mpc.constraint_expression(each)(x, u, theta))) for each in along]
+    return [*found, *((each.soft, ca.densify(each.expression(x))) for each in mpc.state_bounds)]
+
+
+def repriced(mpc: MPC, factor: float) -> MPC:
+    """The problem with the prices of its soft limits multiplied, as where its costs are.
+
+    Args:
+        mpc: The problem.
+        factor: Positive.
+    """
+    if factor == 1.0 or not isinstance(mpc.constraints, tuple):
+        return mpc
+    changed = [
+        each
+        if not isinstance(each, Constraint | StateBounds) or each.soft is None
+        else replace(each, soft=Penalty(each.soft.l1 * factor, each.soft.l2 * factor))
+        for each in mpc.constraints
+    ]
+    return mpc.replace(constraints=changed)
