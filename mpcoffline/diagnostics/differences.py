@@ -12,6 +12,7 @@ from mpcoffline.simulation.trials import Trials
 
 SURE = 2.0  # standard errors
 TODAY = "today"  # the clone of the controller that made the log
+_ENOUGH = 5  # starts
 _OUTVOTED = 4  # votes from which on one of them may be an outlier
 
 
@@ -207,8 +208,13 @@ def starts_of(trials: Trials, name: str) -> NDArray[np.bool_]:
 
 
 def whole_episodes(trials: Trials) -> NDArray[np.bool_]:
-    """The starts at which episodes of the log began, which tell what one costs; all where there are hardly any."""
-    return trials.begun if trials.begun.sum() > 1 else np.ones(len(trials.rows), dtype=bool)
+    """The starts at which episodes of the log began, which tell what one costs; all where there are hardly any.
+
+    Those whose episode is as long as a simulated one, where there are some: so that all costs are of the same starts.
+    """
+    begun = trials.begun if trials.begun.sum() > 1 else np.ones(len(trials.rows), dtype=bool)
+    known = begun & np.isfinite(trials.returns)
+    return known if known.sum() >= _ENOUGH else begun
 
 
 def outvoted(n: int) -> int:
