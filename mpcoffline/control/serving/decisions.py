@@ -84,7 +84,7 @@ class DecisionLog:
             values: What was measured, by name; what is missing stays empty.
             applied: The inputs that act, ``(nu,)``.
             wanted: What the policy asked for; None where it was not asked, or gave no answer.
-            decided_by: One of :data:`DECIDED`.
+            decided_by: One of ``"policy"``, ``"transfer"``, ``"hold"``, ``"fallback"``.
             late: Seconds from the begin of the period to the writing of the inputs.
             solving: Seconds that the policy took.
             note: What went wrong; empty where nothing did.
