@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -24,3 +25,11 @@ def test_modules_stay_readable() -> None:
     assert modules
     lengths = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in modules}
     assert {name: n for name, n in lengths.items() if n > 400} == {}
+
+
+def test_all_packages_are_installed() -> None:
+    """Each folder with modules is in pyproject.toml's list, which the wheel is made from."""
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / "mpcoffline").rglob("__init__.py")}
+    linked = {"mpcoffline.envs", "mpcoffline.datasets.catalog"}
+    assert {".".join(folder.parts) for folder in folders} | linked == set(listed)
