@@ -56,7 +56,8 @@ def test_the_page_is_written_once_it_is_whole(
 def judged(cost: float, verdict: str, simulated: float, expected: tuple[float, float, float]) -> dict[str, Any]:
     return {
         "name": "some fit", "verdict": verdict, "reasons": ["why"], "cost": cost, "gain": cost - 100.0,
-        "gain_error": 1.0, "simulated": simulated, "expected": list(expected), "would_withhold": [], "worse_than_today": cost > 120.0,
+        "gain_error": 1.0, "simulated": simulated, "expected": list(expected), "would_withhold": [],
+        "worse_than_today": cost > 120.0,
     }  # fmt: skip
 
 
