@@ -111,7 +111,7 @@ def serve(
         try:
             service.run(periods)
         except KeyboardInterrupt:
-            messages.print("Ended; the fall-back input was written last." if safe else "Ended; the inputs stay.")
+            messages.print("Ended; the fall-back input was sent last." if safe else "Ended; the inputs stay.")
     stats = service.stats
     if as_json:
         print_json({"policy": policy, "log": log} | vars(stats))

@@ -23,17 +23,26 @@ def penalty_function(mpc: MPC) -> ca.Function | None:
     """
     x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
     total, found = ca.SX(0), False
-    for soft, h in _limits(mpc, x, u, theta):
-        if soft is not None and h.numel():
+    for _, soft, h in limit_expressions(mpc, x, u, theta):
+        if soft is not None:
             over = ca.fmax(h, 0.0)
             total, found = total + soft.l1 * ca.sum1(over) + soft.l2 * ca.sumsqr(over), True
     return ca.Function("penalty", [x, u, theta], [ca.densify(total)]) if found else None
 
 
-def _limits(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> list[tuple[Penalty | None, ca.SX]]:
+def limit_expressions(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> list[tuple[str, Penalty | None, ca.SX]]:
+    """All limits along the horizon, hard ones too: name, prices (None for a hard one), and h ``(n, 1)``, kept if <= 0.
+
+    Args:
+        mpc: The problem.
+        x: State, ``(nx, 1)``.
+        u: Inputs, ``(nu, 1)``.
+        theta: Parameters, ``(size, 1)``.
+    """
     along = mpc.constraints_at("stages")
-    found = [(each.soft, ca.densify(mpc.constraint_expression(each)(x, u, theta))) for each in along]
-    return [*found, *((each.soft, ca.densify(each.expression(x))) for each in mpc.state_bounds)]
+    found = [(each.name, each.soft, ca.densify(mpc.constraint_expression(each)(x, u, theta))) for each in along]
+    found += [(each.name, each.soft, ca.densify(each.expression(x))) for each in mpc.state_bounds]
+    return [each for each in found if each[2].numel()]
 
 
 def repriced(mpc: MPC, factor: float) -> MPC:

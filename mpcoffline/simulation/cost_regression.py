@@ -116,8 +116,8 @@ def cost_regressions(x: Array, cost: Array, folds: NDArray[np.intp], seed: int) 
     The quadratic comes first, unless what is richer has at most three quarters of its squared error: that finds
     structure in noise, and a controller that is simulated on it gains from that. Then there are two of them, from
     other episodes each. (Of 17 logs, 13 kept the quadratic. Where the cost has kinks, or is a norm, a network missed
-    between a third and an eightieth of what random features did; where it is a distance, norms a quarter of that, and
-    most of what they do not miss is near the goal, where controllers are.)
+    between a third and an eightieth of what random features did; where it is a distance, norms missed a quarter of what
+    a network did, which is too dear near the goal, where controllers stay.)
 
     Args:
         x: (s, a), ``(n, d)``.

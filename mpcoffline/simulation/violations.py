@@ -10,6 +10,7 @@ import numpy as np
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Penalty
+from mpcoffline.mpc.penalties import limit_expressions
 
 TRIFLE = 1e-3  # of how far h moves: a violation by less is rounding and noise
 
@@ -37,13 +38,8 @@ class LimitFunction(NamedTuple):
 def limit_functions(mpc: MPC) -> Iterator[LimitFunction]:
     """All limits along the horizon; those at its end hold nowhere in an episode."""
     x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
-    for constraint in mpc.constraints_at("stages"):
-        h = ca.densify(mpc.constraint_expression(constraint)(x, u, theta))
-        yield LimitFunction(constraint.name, constraint.soft, ca.Function("h", [x, u, theta], [h]))
-    for bounds in mpc.state_bounds:
-        h = ca.densify(bounds.expression(x))
-        if h.numel():
-            yield LimitFunction(bounds.name, bounds.soft, ca.Function("h", [x, u, theta], [h]))
+    for name, soft, h in limit_expressions(mpc, x, u, theta):
+        yield LimitFunction(name, soft, ca.Function("h", [x, u, theta], [h]))
 
 
 def moved(h: Array) -> Array:

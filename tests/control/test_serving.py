@@ -187,6 +187,25 @@ def test_slow_and_failing_policies_never_end_the_loop(monkeypatch: pytest.Monkey
     assert [watched.written[k] == watched.written[k - 1] for k in (4, 8, 12)] == [True] * 3
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, MemoryError])
+def test_whatever_ends_the_loop_leaves_the_fall_back(
+    error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, device, policy = lab()
+    watched, whole, calls = Broken(device), policy.predict, iter(range(100))
+
+    def predict(y: Any, state: Any = None) -> Any:
+        if next(calls) == 3:
+            raise error
+        return whole(y, state)
+
+    monkeypatch.setattr(policy, "predict", predict)
+    with pytest.raises(error):
+        Service(policy, watched, clock=clock, fallback={"power": 7.0}).run(20)
+    assert len(watched.written) == 4
+    assert watched.written[-1] == 7.0
+
+
 @pytest.mark.parametrize("values", [{"T": 30.0}, {"T": np.nan, "ambient": 20.0}, {"T": "warm", "ambient": 20.0}, None])
 def test_an_incomplete_measurement_is_none(values: Any) -> None:
     clock, device, policy = lab()

@@ -175,8 +175,10 @@ class Service:
                 for _ in range(passed if self._layout.n_memory else 0):
                     self._memory = self._layout.remembered(self._memory, self._applied)
                 k += 1 + passed
-        except (MPCOfflineError, KeyboardInterrupt):
-            self._write(np.where(np.isnan(self._fallback), self._applied, self._fallback), math.inf)
+        except BaseException:  # whatever it is: nobody is in charge from here on
+            last = np.where(np.isnan(self._fallback), self._applied, self._fallback)
+            if (refused := self._write(last, math.inf)) is not None:
+                self._tell(f"At the end: {refused}")
             raise
         return self.stats
 
