@@ -55,8 +55,8 @@ def test_the_page_is_written_once_it_is_whole(
 
 def judged(cost: float, verdict: str, simulated: float, expected: tuple[float, float, float]) -> dict[str, Any]:
     return {
-        "name": "some fit", "verdict": verdict, "reasons": ["why"], "cost": cost, "gain": cost - 100.0,
-        "gain_error": 1.0, "simulated": simulated, "expected": list(expected), "would_withhold": [],
+        "name": "some fit", "verdict": verdict, "reasons": ["why"], "cost": cost, "from_log": cost + 1.0,
+        "gain": cost - 100.0, "gain_error": 1.0, "simulated": simulated, "expected": list(expected),
         "worse_than_today": cost > 120.0,
     }  # fmt: skip
 
@@ -82,6 +82,6 @@ def test_the_page_counts_what_must_not_be(bench: Any) -> None:
     assert "| worse than the logged controller, and told | 0 of 0 | 1 of 1 |" in page
     assert "| true cost within the report's band | 2 of 2 | 1 of 2 |" in page
     assert (
-        "| pendulum 1 log default 2 | 110 | 100 | some fit | 100 | 100 (90 to 110) | keep MPC_1 | 130 | recommend |"
-        in page
+        "| pendulum 1 log default 2 | 110 | 100 | some fit | 100 | 101 | 100 (90 to 110) | keep MPC_1 | 130"
+        " | recommend |" in page
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.checks import check_integers, check_known
+from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -53,7 +53,6 @@ from .notes import Fit, notes_on
 from .report import PredictionCheck, Report, Trust
 from .stability import TheoremCheck, closed_loop_eigenvalues, leaves_reference, value_growth, weight_checks
 from .verdict import decide
-from .withholding import DEFAULT_RULES, RULES
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -68,7 +67,6 @@ def diagnose(
     n_starts: int | None = None,
     n_steps: int | None = None,
     seed: int = 0,
-    rules: Sequence[str] = DEFAULT_RULES,
     today: int | None = None,
 ) -> Report:
     """Diagnoses a fit from the log alone.
@@ -90,7 +88,6 @@ def diagnose(
         n_starts: Episodes simulated on each model; by default as in the choice, 64 or fewer.
         n_steps: Their length; by default that of the logged ones.
         seed: Seeds models, starts and noise.
-        rules: Names of the rules that may withhold a recommendation, of ``mpcoffline.diagnostics.withholding.RULES``.
         today: How many episodes, the first ones, were made by the controller that runs today; all by default. Others,
             as of a trial, tell what the plant does, not what runs today.
 
@@ -99,14 +96,11 @@ def diagnose(
 
     Raises:
         MPCOfflineError: If the learner was not fitted.
-        UnknownIdError: For a rule that there is none of.
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     counts = {"n_starts": n_starts, "n_steps": n_steps}
     counts |= {"today": today}
     check_integers(1, **{name: count for name, count in counts.items() if count is not None})
-    for name in rules:
-        check_known("rule", name, RULES)
     nominal, learned = learner.nominal_mpc, learner.mpc
     if learner.value_function is None:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
@@ -146,17 +140,7 @@ def diagnose(
     shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
-    judgement = decide(
-        trials,
-        chosen,
-        lag=lag,
-        noise=found.noise,
-        n_rows=len(table),
-        cost_r2=cost.r2,
-        failed=failed[1],
-        choice=choice,
-        rules=tuple(rules),
-    )
+    judgement = decide(trials, chosen, failed=failed[1], choice=choice)
     limits = limit_checks(nominal, table, first, second, learned) if nominal.constraints is not None else ()
     if chosen != FIRST:
         judgement = with_limits(judgement, limits)

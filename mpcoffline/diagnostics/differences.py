@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ SURE = 2.0  # standard errors
 TODAY = "today"  # the clone of the controller that made the log
 _ENOUGH = 5  # starts
 _OUTVOTED = 4  # votes from which on one of them may be an outlier
+_FENCE = 3.0  # interquartile ranges
 
 
 @dataclass(frozen=True)
@@ -30,27 +32,27 @@ class Difference:
         models: Names of the models.
         mean: Mean over the starts, ``(n,)``.
         error: Its standard error, inf for a single start, ``(n,)``.
-        second: The mean with another regression of the logged cost, ``(n,)``.
-        second_error: Its standard error, ``(n,)``.
+        low: What it is at least, by two standard errors (see :func:`bounds`), ``(n,)``.
+        high: What it is at most, ``(n,)``.
+        second_high: What it is at most with another regression of the logged cost, ``(n,)``.
     """
 
     name: str
     models: tuple[str, ...]
     mean: Array
     error: Array
-    second: Array
-    second_error: Array
+    low: Array
+    high: Array
+    second_high: Array
 
     @classmethod
     def of(cls, trials: Trials, name: str, other: str) -> Difference:
         """From trials, on the starts by which the controller is judged."""
         i, k = trials.names.index(name), trials.names.index(other)
         starts, votes = starts_of(trials, name), trials.votes
-        both = [
-            paired(costs[i][votes][:, starts], costs[k][votes][:, starts]) for costs in (trials.cost, trials.second)
-        ]
+        own, second = ([costs[j][votes][:, starts] for j in (i, k)] for costs in (trials.cost, trials.second))
         models = tuple(model for model, vote in zip(trials.models, votes, strict=True) if vote)
-        return cls(name, models, *both[0], *both[1])
+        return cls(name, models, *paired(*own), *bounds(*own), bounds(*second)[1])
 
     def __len__(self) -> int:
         """Number of models."""
@@ -64,12 +66,12 @@ class Difference:
     @property
     def better(self) -> NDArray[np.bool_]:
         """On which models the controller is cheaper beyond two standard errors, by both regressions, ``(n,)``."""
-        return (self.mean + SURE * self.error < 0.0) & (self.second + SURE * self.second_error < 0.0)
+        return (self.high < 0.0) & (self.second_high < 0.0)
 
     @property
     def worse(self) -> NDArray[np.bool_]:
         """On which models it is dearer beyond two standard errors, ``(n,)``."""
-        return np.asarray(self.mean - SURE * self.error > 0.0)
+        return np.asarray(self.low > 0.0)
 
     @property
     def undecided(self) -> float:
@@ -101,9 +103,10 @@ class Today:
         logged: Mean cost of the log's own episodes from the same starts; NaN where none is as long.
         logged_error: Its standard error.
         logged_spread: Standard deviation of these costs over the starts.
-        low: The smaller of both differences, less two standard errors, ``(n,)``.
-        high: The larger, and two standard errors, ``(n,)``.
+        low: What both differences are at least, by two standard errors (see :func:`bounds`), ``(n,)``.
+        high: What they are at most, ``(n,)``.
         disagreement: J(clone) - logged, ``(n,)``; NaN without one of them.
+        disagreement_error: Its standard error, ``(n,)``.
     """
 
     logged: float
@@ -112,6 +115,7 @@ class Today:
     low: Array
     high: Array
     disagreement: Array
+    disagreement_error: Array
 
     @classmethod
     def of(cls, trials: Trials, name: str) -> Today:
@@ -119,19 +123,18 @@ class Today:
         votes, whole = trials.votes, whole_episodes(trials)
         costs, returns = trials.of(name)[votes][:, whole], trials.returns[whole]
         known = returns[np.isfinite(returns)]
-        ways = [paired(costs, np.broadcast_to(returns, costs.shape))]
-        disagreement = np.full(len(costs), np.nan)
+        ways = [bounds(costs, np.broadcast_to(returns, costs.shape))]
+        disagreement = np.full(len(costs), np.nan), np.full(len(costs), np.nan)
         if TODAY in trials.names:
             clone = trials.of(TODAY)[votes][:, whole]
-            ways.append(paired(costs, clone))
-            disagreement = paired(clone, np.broadcast_to(returns, clone.shape))[0]
-        with np.errstate(invalid="ignore"):
-            ends = np.array([[mean - SURE * error, mean + SURE * error] for mean, error in ways])  # (ways, 2, n)
+            ways.append(bounds(costs, clone))
+            disagreement = paired(clone, np.broadcast_to(returns, clone.shape))
+        ends = np.array(ways)  # (ways, 2, n)
         ends = np.where(np.isfinite(ends).all(axis=1, keepdims=True), ends, np.nan)
         low, high = np.fmin.reduce(ends[:, 0]), np.fmax.reduce(ends[:, 1])
         spread = float(known.std(ddof=1)) if len(known) > 1 else np.nan
         logged = float(known.mean()) if len(known) else np.nan
-        return cls(logged, spread / np.sqrt(max(1, len(known))), spread, low, high, disagreement)
+        return cls(logged, spread / np.sqrt(max(1, len(known))), spread, low, high, *disagreement)
 
     @property
     def known(self) -> bool:
@@ -220,6 +223,34 @@ def whole_episodes(trials: Trials) -> NDArray[np.bool_]:
 def outvoted(n: int) -> int:
     """How many of n models may object and be named, not obeyed."""
     return 1 if n >= _OUTVOTED else 0
+
+
+def bounds(costs: Array, others: Array) -> tuple[Array, Array]:
+    """What the mean over the starts of costs ``(n, starts)`` minus others is at least and at most, ``(n,)`` each.
+
+    Two standard errors about it. Where a few starts differ enormously (a pendulum that never swings up, a reactor that
+    runs away), these make the error as large as the mean, however sure its sign is. What they save is counted as an
+    ordinary large one for the upper bound, what they lose for the lower bound::
+
+        mean(d) <= mean(max(d, floor)),  mean(d) >= mean(min(d, ceiling)),      whatever floor and ceiling are
+
+    They are Tukey's outer fences, three interquartile ranges from the quartiles: what is normal has nothing beyond.
+    """
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # where no start was tried
+        difference = costs - others
+        if not difference.size:
+            return _two_errors(difference)
+        first, third = np.nanquantile(difference, (0.25, 0.75), axis=1, keepdims=True, method="nearest")
+        reach = _FENCE * (third - first)
+        cut_gains, cut_losses = np.maximum(difference, first - reach), np.minimum(difference, third + reach)
+        lows, highs = zip(*(_two_errors(each) for each in (difference, cut_gains, cut_losses)), strict=True)
+        return np.fmax(lows[0], lows[2]), np.fmin(highs[0], highs[1])
+
+
+def _two_errors(difference: Array) -> tuple[Array, Array]:
+    mean, error = paired(difference, np.zeros_like(difference))
+    return mean - SURE * error, mean + SURE * error
 
 
 def paired(costs: Array, others: Array) -> tuple[Array, Array]:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from mpcoffline.core.text import figure, listed
 from mpcoffline.core.types import Array
-from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.simulation.trials import Trials
 
 from .differences import SURE, TODAY, Difference, Today, outvoted, paired, starts_of, whole_episodes
-from .measures import LagCheck
-from .withholding import DEFAULT_RULES, RULES, Evidence, gone_wrong
+from .withholding import NO_MODEL_PREDICTS, gone_wrong, runaway
 
 Verdict = Literal["recommend", "try with care", "keep MPC_1"]
 
@@ -34,8 +32,8 @@ class Judgement:
         proposal: The controller that was judged.
         first: Its cost minus that of MPC_1; None where no model has a vote.
         today: It against the controller that made the log.
-        expected: Lowest, middle and highest mean cost of an episode that the models, and today's cost with the
-            difference to today, let expect; NaN where no model has a vote.
+        expected: Lowest, middle and highest mean cost of an episode that the models let expect, as they are and less
+            what they have wrong of the controller that made the log; NaN where no model has a vote.
     """
 
     verdict: Verdict
@@ -51,48 +49,36 @@ def decide(
     trials: Trials,
     proposal: str,
     *,
-    lag: LagCheck | None = None,
-    noise: NoiseEstimate | None = None,
-    n_rows: int | None = None,
-    cost_r2: float = 1.0,
     failed: float = 0.0,
     choice: Trials | None = None,
-    rules: tuple[str, ...] = DEFAULT_RULES,
 ) -> Judgement:
     """The verdict and why.
 
     All figures are differences of costs of the same start on the same model, in the unit of the logged cost; only
     models with a vote count. Recommended is a controller that is cheaper than MPC_1 beyond two standard errors, by both
     regressions of the cost, on all of them but one (of four or more: an outlier is named, not obeyed), and cheaper than
-    what runs today by more than models and log disagree about that, unless a rule withholds it. Costs ``a L + b`` with
-    a > 0 give the verdict of L.
+    what runs today by more than models and log disagree about that, unless it is lost more often than MPC_1. Costs
+    ``a L + b`` with a > 0 give the verdict of L.
 
     Args:
         trials: MPC_1, the proposal, perhaps the clone of today's controller, on the models of the log.
         proposal: Name of the controller that is judged; ``"MPC_1"`` where nothing better was found.
-        lag: Whether inputs act late, for the rule of that name.
-        noise: Measurement noise, likewise.
-        n_rows: Transitions in the data, likewise.
-        cost_r2: Share of the logged costs' variance that the simulated cost explains, likewise.
         failed: Share of the proposal's problems that were not solved at first.
         choice: The trials in which the proposal was chosen, if they are others: what else was tried.
-        rules: Names of the rules of :data:`RULES` that may withhold a recommendation.
 
     Returns:
         The judgement.
     """
-    if not trials.votes.any() and "no model predicts" not in rules:
-        trials = replace(trials, votes=np.ones_like(trials.votes))
-    evidence = Evidence(trials, proposal, lag, noise, n_rows, cost_r2)
-    doubts = [text for name in rules if (text := RULES[name](evidence)) is not None]
     today, expected = Today.of(trials, proposal), _expected(trials, proposal)
     if not trials.votes.any():
-        return Judgement("keep MPC_1", tuple(doubts), proposal, None, today, expected)
+        return Judgement("keep MPC_1", (NO_MODEL_PREDICTS,), proposal, None, today, expected)
     if proposal == trials.names[0]:
         reasons = (_nothing_better(choice or trials), *_of_today(today, trials, proposal))
         return Judgement("keep MPC_1", reasons, proposal, Difference.of(trials, proposal, proposal), today, expected)
     first = Difference.of(trials, proposal, trials.names[0])
-    told = [*_of_today(today, trials, proposal), *gone_wrong(evidence), *_failures(failed)]
+    lost = runaway(trials, proposal)
+    doubts = () if lost is None else (lost,)
+    told = [*_of_today(today, trials, proposal), *gone_wrong(trials, proposal), *_failures(failed)]
     if not _gains(first, trials):
         return Judgement("keep MPC_1", (_no_gain(first, trials), *told, *doubts), proposal, first, today, expected)
     if today.known and today.worse:
@@ -107,8 +93,7 @@ def decide(
 def _gains(first: Difference, trials: Trials) -> bool:
     """Whether the median model says that the controller is cheaper, beyond two standard errors and a trifle."""
     k = first.middle
-    gain = -first.mean[k] - SURE * first.error[k]
-    return bool(gain > 0.0 and -first.mean[k] > _LEAST * _spread(trials, first, k))
+    return bool(first.high[k] < 0.0 and -first.mean[k] > _LEAST * _spread(trials, first, k))
 
 
 def _spread(trials: Trials, first: Difference, k: int) -> float:
@@ -129,7 +114,10 @@ def _costs(trials: Trials, name: str, first: Difference, k: int) -> Array:
 
 
 def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
-    """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts."""
+    """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts.
+
+    And what the median model lets expect less what it said too much of the controller that made the log.
+    """
     costs = trials.of(proposal)[trials.votes][:, whole_episodes(trials)]
     mean, error = paired(costs, np.zeros_like(costs))
     known = np.isfinite(mean) & np.isfinite(error)
@@ -138,10 +126,14 @@ def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
     order, out = np.sort(mean[known]), outvoted(int(known.sum()))
     kept, doubt = order[out : len(order) - out], SURE * float(np.median(error[known]))
     ends = [float(kept[0]) - doubt, float(kept[-1]) + doubt]
+    middle = float(np.median(order))
     today = Today.of(trials, proposal)
-    if today.known and np.isfinite(today.logged):
-        ends += [today.logged + each for each in today.middle]
-    return min(ends), float(np.median(order)), max(ends)
+    off = np.flatnonzero(np.isfinite(today.disagreement) & np.isfinite(today.disagreement_error))
+    if len(off):
+        k = off[np.argsort(today.disagreement[off], kind="stable")[len(off) // 2]]
+        doubt += SURE * float(today.disagreement_error[k])
+        ends += [middle - float(today.disagreement[k]) + sign * doubt for sign in (-1.0, 1.0)]
+    return min(ends), middle, max(ends)
 
 
 # ---------------------------------------------------------------- sentences
@@ -151,9 +143,13 @@ def _number(value: float) -> str:
     return figure(value, 4)
 
 
-def _pair(mean: float, error: float) -> str:
-    doubt = f"+- {figure(SURE * error, 2)}" if np.isfinite(error) else "(from too few starts)"
-    return f"{figure(mean)} {doubt}"
+def _size(first: Difference, k: int) -> str:
+    """How large the difference on model k is, with its doubt."""
+    size, doubt = abs(first.mean[k]), SURE * first.error[k]
+    surely = max(-first.high[k], first.low[k])
+    if surely > 0.0 and not size > doubt:
+        return f"{figure(size)} (surely {figure(surely, 2)}, the rest is a matter of few starts)"
+    return f"{figure(size)} " + (f"+- {figure(doubt, 2)}" if np.isfinite(doubt) else "(from too few starts)")
 
 
 def _called(name: str) -> str:
@@ -170,7 +166,7 @@ def _gain(first: Difference, trials: Trials) -> str:
     size = "" if alike else f" The models do not agree about the size ({figure(kept[0])} to {figure(kept[-1])})."
     starts = int(starts_of(trials, first.name).sum())
     return (
-        f"{_called(first.name)} costs {_pair(-first.mean[k], first.error[k])} less than {trials.names[0]} an episode of"
+        f"{_called(first.name)} costs {_size(first, k)} less than {trials.names[0]} an episode of"
         f" {trials.n_steps} steps ({levels}, median model, {starts} starts), beyond two standard"
         f" errors on {int(first.better.sum())} of {n} models that predict the log.{size}"
     )
@@ -178,27 +174,27 @@ def _gain(first: Difference, trials: Trials) -> str:
 
 def _no_gain(first: Difference, trials: Trials) -> str:
     k, name = first.middle, _called(first.name)
-    mean, error, n = first.mean[k], first.error[k], int(starts_of(trials, first.name).sum())
+    mean, n = first.mean[k], int(starts_of(trials, first.name).sum())
     if np.isnan(mean):
         return f"{name} could not be simulated from any start: nothing is known of it."
-    if mean - SURE * error > 0.0:
+    if first.low[k] > 0.0:
         return (
-            f"{name} costs {_pair(mean, error)} more than {trials.names[0]} an episode of {trials.n_steps} steps"
+            f"{name} costs {_size(first, k)} more than {trials.names[0]} an episode of {trials.n_steps} steps"
             f" on the median model: dearer beyond two standard errors on {int(first.worse.sum())} of {len(first)}. Look"
             " at the candidates for another one, or record data where the learned MPC goes."
         )
-    if mean == error == 0.0:
+    if mean == first.error[k] == 0.0:
         return (
             f"{name} costs as much as {trials.names[0]} from each of {n} starts on the median model: in"
             " simulations there is no gain, and what a trial would show is open."
         )
     text = (
-        f"{name} costs {_pair(abs(mean), error)} {'less' if mean < 0.0 else 'more'} than {trials.names[0]} an"
+        f"{name} costs {_size(first, k)} {'less' if mean < 0.0 else 'more'} than {trials.names[0]} an"
         f" episode of {trials.n_steps} steps on the median model: no clear gain."
     )
-    if mean + SURE * error < 0.0:
+    if first.high[k] < 0.0:
         return f"{text} It is less than {_LEAST:.1%} of how much the starts differ: both are as good."
-    needed = n * (SURE * error / abs(mean)) ** 2 if mean < 0.0 else np.inf
+    needed = n * (SURE * first.error[k] / abs(mean)) ** 2 if mean < 0.0 else np.inf
     if needed < _MANY_STARTS:
         return f"{text} About {int(np.ceil(needed / 10.0)) * 10} starts would decide (n_starts=)."
     return text
@@ -212,8 +208,8 @@ def _nothing_better(trials: Trials) -> str:
         return f"{trials.names[0]} is the only candidate."
     best = min(tried, key=lambda each: np.nan_to_num(each.mean[each.middle], nan=np.inf))
     k, n = best.middle, int(starts_of(trials, best.name).sum())
-    gain = f"{_pair(abs(best.mean[k]), best.error[k])} {'less' if best.mean[k] < 0.0 else 'more'} an episode"
-    if best.mean[k] + SURE * best.error[k] < 0.0:  # it left before the starts that judge, or another went there
+    gain = f"{_size(best, k)} {'less' if best.mean[k] < 0.0 else 'more'} an episode"
+    if best.high[k] < 0.0:  # it left before the starts that judge, or another went there
         return (
             f"The choice kept {trials.names[0]}. Of {len(tried)} candidates, {_called(best.name)} costs {gain} on the"
             f" median model from {n} starts, on {int(best.better.sum())} of {len(best)} models clearly, but no other"
@@ -233,7 +229,7 @@ def _objections(first: Difference, trials: Trials) -> tuple[str, ...]:
     names = listed([f"{first.models[k]} ({figure(first.mean[k], sign=True)})" for k in objecting], 4)
     if first.agreed:
         return (f"One of {len(first)} models says otherwise, {names}: an outlier, named and not obeyed.",)
-    by_cost = (first.mean + SURE * first.error < 0.0) & ~first.better
+    by_cost = (first.high < 0.0) & ~first.better
     if by_cost.sum() > len(objecting) / 2:
         return (
             f"With the other regression of the logged cost the gain is not clear on {int(by_cost.sum())} of"

@@ -89,7 +89,6 @@ class Outcome:
         verdict: That of ``diagnose`` on the learned MPC, where it was asked.
         reason: Its first reason.
         warned: 1 if it says that the learned MPC is worse, or rather worse, than what runs today; else 0.
-        would_withhold: Names of the rules that would have withheld a recommendation, were all of them on.
         from_log: Cost of the learned MPC from where the episodes of the log began, of which the verdict speaks.
         expected: What it expects an episode of the learned MPC to cost, where it simulates whole ones.
         lowest: The lowest that it expects.
@@ -135,7 +134,6 @@ class Outcome:
     verdict: str = ""
     reason: str = ""
     warned: float = NAN
-    would_withhold: str = ""
     from_log: float = NAN
     expected: float = NAN
     lowest: float = NAN
@@ -277,14 +275,11 @@ def _judge(
 ) -> None:
     """What ``diagnose`` says of what was handed out, and of the whole fit."""
     from mpcoffline.diagnostics import diagnose
-    from mpcoffline.diagnostics.withholding import RULES, Evidence
 
     start = _core_seconds()
     report = diagnose(learner, table, seed=seed)
     found["verdict_s"] = _core_seconds() - start
     found["verdict"], found["reason"] = report.verdict, _short(report.reasons[0] if report.reasons else "")
-    evidence = Evidence.of(report)
-    found["would_withhold"] = ", ".join(name for name, rule in RULES.items() if rule(evidence) is not None)
     if report.trials.n_steps == n_steps:
         found["lowest"], found["expected"], found["highest"] = report.judgement.expected
     found["warned"] = _warned(report)

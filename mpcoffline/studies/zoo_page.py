@@ -155,13 +155,6 @@ def _of_verdicts(rows: Sequence[Outcome]) -> list[str]:
             f" deviation **{np.median(off):.1%}**, 90 % within **{np.quantile(off, 0.9):.0%}**; within the report's own"
             f" band {inside} of {len(known)}"
         )
-    for name in sorted({name for o in rows for name in o.would_withhold.split(", ") if name}):
-        said = [o for o in rows if name in o.would_withhold.split(", ") and recommended(o, full=False)]
-        right_ones, wrong_ones = sum(o.better for o in said), sum(o.worse for o in said)
-        lines += [
-            f"* The rule {name!r} would have withheld {len(said)} recommendations: of {right_ones} controllers that are"
-            f" better, {wrong_ones} that are worse"
-        ] * bool(said)
     total = [o.fit_s + o.verdict_s for o in rows]
     return [*lines, f"* Time in s of one core: verdict {_range([o.verdict_s for o in rows])}; with fit {_range(total)}"]
 

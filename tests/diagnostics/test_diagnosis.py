@@ -15,7 +15,7 @@ from lq_plant import QuadraticValue
 
 import mpcoffline
 from mpcoffline import OfflineMPCLearner, TransitionTable
-from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError
 from mpcoffline.diagnostics import Report, diagnose
 from mpcoffline.diagnostics.page import page_of
 from mpcoffline.estimation.smoothing import with_measurement_noise
@@ -149,8 +149,6 @@ def test_what_cannot_be_diagnosed_is_refused() -> None:
     with pytest.raises(MPCOfflineError, match="fit"):
         diagnose(OfflineMPCLearner(WRONG, preset="paper"), LOG)
     learner = fitted(WRONG, candidate="full")
-    with pytest.raises(UnknownIdError, match="'lag'"):
-        diagnose(learner, LOG, rules=["lags"])
     with pytest.raises(InvalidArgumentError, match="n_starts"):
         diagnose(learner, LOG, n_starts=0)
     pendulum = TransitionTable.from_arrays(
