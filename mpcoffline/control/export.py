@@ -158,7 +158,7 @@ def _vectors(policy: MPCPolicy) -> list[list[float]]:
             solution = policy.solver.solve(z, warm_start=state)
             if not solution.success:  # its action would say nothing
                 break
-            state = solution.plan.shifted()
+            state = solution.plan.shifted(mpc)
             rows.append([float(step == 0), *z[: mpc.ny].tolist(), *solution.u0.tolist()])
             z = mpc.model(z, solution.u0)
     if not rows:

@@ -146,7 +146,7 @@ class Fallback:
         self.stats.n_solves += len(x)
         self.stats.count(solution)
         if solution.success.all():
-            return solution.u0, solution.plan.shifted()
+            return solution.u0, solution.plan.shifted(self.mpc)
         rows = np.flatnonzero(~solution.success)
         self.stats.n_failures += len(rows)
         states, before = x[rows], warm_start.rows(rows)
@@ -204,7 +204,7 @@ class Fallback:
         inputs = every.u[:, 0].copy()
         nothing = ~Plan(x, u).known
         inputs[rows[nothing]] = np.clip(0.0, low, high)
-        plan = every.shifted()
+        plan = every.shifted(self.mpc)
         plan.x[rows[nothing]] = plan.u[rows[nothing]] = np.nan
         if plan.multipliers is not None:
             plan.multipliers[rows] = np.nan

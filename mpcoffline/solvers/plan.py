@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -10,8 +12,9 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
-# A rest is where a plan moves less than a tenth as fast as it ever does, and less than half as fast as at its end.
-_OF_LARGEST, _OF_LAST = 0.01, 0.25  # of the squares
+# A plan can wait where it moves less than half as fast as at its end; it rests where it moves less than a tenth as fast
+# as it ever does.
+_OF_LAST, _OF_LARGEST = 0.25, 0.01  # of the squares
 
 
 class Plan(tuple[Array, ...]):
@@ -68,14 +71,18 @@ class Plan(tuple[Array, ...]):
             x, u = (a.reshape(len(a), -1) @ np.zeros(a[0].size) for a in self[:2])
             return np.asarray(x + u == 0.0)
 
-    def shifted(self) -> Plan:
+    def shifted(self, mpc: MPC | None = None) -> Plan:
         """The plan one step later. The step that it lacks is a pause: at its end, or on its way where that rests.
 
         An optimal plan may stay where the stage cost is low, and leave that place towards its end only, for where the
         terminal cost is low (a turnpike). Each plan leaves as many steps before its end, and so one step later.
+
+        Args:
+            mpc: The problem: then a plan also waits where it moves, but half as fast as at its end, and at a lower
+                stage cost. (The best a plant can do for long may be no rest: what it holds may be used up slowly.)
         """
         last = self.u.shape[1]
-        pause = pauses(self.x)
+        pause = pauses(self.x, None if mpc is None else partial(self._cheaper, mpc))
         arrays = [np.concatenate([a[:, 1 : last + 1], a[:, last:]], axis=1) for a in self[::2]]
         arrays.insert(1, np.concatenate([self.u[:, 1:], self.u[:, -1:]], axis=1))
         waits = np.flatnonzero(pause < last)
@@ -85,6 +92,14 @@ class Plan(tuple[Array, ...]):
                 n = min(last + 1, new.shape[1])
                 new[waits, :n] = np.where(behind[:, :n], old[waits, :n], new[waits, :n])
         return Plan(*arrays)
+
+    def _cheaper(self, mpc: MPC, rows: NDArray[np.intp], steps: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Whether steps cost less than the last ones."""
+        at, end = (
+            mpc.stage_function(self.x[rows, k].T, self.u[rows, i].T, mpc.theta).full()[0]
+            for k, i in ((steps, steps), (-1, -1))
+        )
+        return np.asarray(at < end)
 
     def rows(self, chosen: NDArray[Any]) -> Plan:
         """Some of the rows."""
@@ -98,10 +113,17 @@ class Plan(tuple[Array, ...]):
         return Plan(*arrays)
 
 
-def pauses(x: Array) -> NDArray[np.intp]:
+def pauses(
+    x: Array, cheaper: Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]] | None = None
+) -> NDArray[np.intp]:
     """Where trajectories ``(B, N + 1, nx)`` can wait for a step, ``(B,)``: N but where one rests before.
 
-    Each state is measured by its own largest step. (Where a swing turns, it is slow as well, but does not rest.)
+    Each state is measured by its own largest step. (Where a swing turns, it is slow as well, but neither does it rest
+    nor is that a cheap place.)
+
+    Args:
+        x: The trajectories.
+        cheaper: Says of rows, and of a step in each, ``(n,)``, whether waiting there costs less than at the end.
     """
     last = x.shape[1] - 1
     if last < 3:
@@ -114,5 +136,12 @@ def pauses(x: Array) -> NDArray[np.intp]:
     )
     about = moved[:, :-1] + moved[:, 1:]
     slowest = about.argmin(axis=1)
-    least = np.minimum(_OF_LARGEST * x.shape[2], _OF_LAST * moved[:, -1])
-    return np.asarray(np.where(about[np.arange(len(x)), slowest] < 2.0 * least, slowest + 1, last))
+    least = about[np.arange(len(x)), slowest]
+    waits = least < 2.0 * _OF_LAST * moved[:, -1]
+    rests = least < 2.0 * _OF_LARGEST * x.shape[2]
+    open_ones = np.flatnonzero(waits & ~rests)
+    if cheaper is None or not len(open_ones):
+        waits &= rests
+    else:
+        waits[open_ones] = cheaper(open_ones, slowest[open_ones] + 1)
+    return np.asarray(np.where(waits, slowest + 1, last))

@@ -36,7 +36,7 @@ def mpc_of(case: str) -> MPC:
             delay=[2, 0],
         )
         return MPC(model, cost, QuadraticCost(np.eye(2)), 12, 0.95, [-1.0, -1.0], [1.0, 1.0])
-    if case == "signals":
+    if case == "signals on time":
         signals = [Signal("set_point", preview=1), Signal("wind", usual=0.3)]
         model = Model(
             lambda x, u, p, d: ca.vertcat(x[0] + 0.1 * x[1], 0.9 * x[1] + ca.sin(u[0]) + 0.1 * d.wind),
@@ -51,6 +51,12 @@ def mpc_of(case: str) -> MPC:
     if case == "turnpike":  # whose plans wait on their way
         model = Model(lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * u), 2, 1, 0.2, discrete=True)
         stage, goal = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]]), QuadraticCost(5.0 * np.eye(2), x_ref=[3.0, 0.0])
+        return MPC(model, stage, goal, 40, 1.0, [-5.0], [5.0])
+    if case == "economic turnpike":  # which they hold while something is used up
+        model = Model(
+            lambda x, u, p: ca.vertcat(x[0] + 0.2 * u, x[1] - 0.1 - 0.05 * x[0] ** 2), 2, 1, 0.2, discrete=True
+        )
+        stage, goal = QuadraticCost(np.diag([1.0, 0.0]), [[0.1]]), QuadraticCost(np.diag([5.0, 0.0]), x_ref=[3.0, 0.0])
         return MPC(model, stage, goal, 40, 1.0, [-5.0], [5.0])
     if case == "stiff motor":  # exact
         model = Model(
@@ -135,8 +141,10 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
         "limits of stages",
         "signals",
         "signals, no bounds",
+        "signals on time",
         "stiff motor",
         "turnpike",
+        "economic turnpike",
         pytest.param("substeps", marks=pytest.mark.slow),
     ],
 )

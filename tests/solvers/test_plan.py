@@ -41,6 +41,21 @@ def test_it_waits_where_it_rests() -> None:
     assert told[:, :, 0].tolist() == [[1, 2, 3, 3, 4, 5, 6, 7, 8, 9], [11, 12, 13, 14, 15, 16, 16, 17, 18, 19]]
 
 
+def test_it_also_waits_where_it_is_slow_at_a_lower_cost_than_at_its_end() -> None:
+    """Each of four is slowest after three steps; the second is a tenth as fast as ever there, and the last is late."""
+    speeds = np.array([[4, 3, 1, 1, 2, 6], [40, 3, 1, 1, 2, 6], [4, 3, 1, 1, 2, 6], [9, 7, 2, 2, 2, 3]], dtype=float)
+    x = np.cumsum(np.hstack([np.zeros((4, 1)), speeds]), axis=1)[:, :, None]
+    asked = []
+
+    def cheaper(rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        asked.append((rows.tolist(), steps.tolist()))
+        return rows == 0
+
+    assert pauses(x).tolist() == [6, 3, 6, 6]
+    assert pauses(x, cheaper).tolist() == [3, 3, 6, 6]
+    assert asked == [([0, 2], [3, 3])]
+
+
 @pytest.mark.parametrize("plan", [Plan.none, lambda n, mpc: Plan(np.ones((n, 9, 2)), np.ones((n, 8, 1)))])
 def test_what_does_not_move_or_is_none_is_held(plan: object) -> None:
     mpc = leaving(8)
@@ -61,6 +76,27 @@ def leaving(horizon: int) -> MPC:
     model = Model(lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * u), 2, 1, 0.2, discrete=True)
     stage, end = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]]), QuadraticCost(5.0 * np.eye(2), x_ref=[3.0, 0.0])
     return MPC(model, stage, end, horizon, 1.0, [-5.0], [5.0])
+
+
+def using_up(horizon: int) -> MPC:
+    """A level that shall be kept, and be another at the end; a stock runs out meanwhile, faster when it is high."""
+    model = Model(lambda x, u, p: ca.vertcat(x[0] + 0.2 * u, x[1] - 0.1 - 0.05 * x[0] ** 2), 2, 1, 0.2, discrete=True)
+    stage, end = QuadraticCost(np.diag([1.0, 0.0]), [[0.1]]), QuadraticCost(np.diag([5.0, 0.0]), x_ref=[3.0, 0.0])
+    return MPC(model, stage, end, horizon, 1.0, [-5.0], [5.0])
+
+
+def test_a_turnpike_on_which_something_moves_is_told_by_the_stage_cost() -> None:
+    mpc = using_up(40)
+    solver = DDPSolver(mpc)
+    plan = solver.solve(np.array([[2.0, 5.0], [-3.0, 1.0]])).plan
+    following = solver.solve(plan.x[:, 1])
+    assert np.abs(plan.shifted().u - following.u).max() > 1.0
+    assert np.abs(plan.shifted(mpc).u - following.u).max() < 0.01
+    iterations = [
+        solver.solve(plan.x[:, 1], warm_start=start).stats["iterations"].sum()
+        for start in (plan.shifted(mpc), plan.shifted())
+    ]
+    assert iterations[0] < iterations[1]
 
 
 def test_a_turnpike_is_next_to_the_next_solution() -> None:

@@ -238,8 +238,8 @@ static int improve(const mpc_problem *m, mpc_state *state, lanes *w) {
     return found ? 1 : 2;
 }
 
-/* Where the plan can wait for a step: at its end, unless it rests before (a turnpike). */
-static int pause_of(const double *x) {
+/* Where the plan can wait for a step: at its end, unless before it rests, or is slower than there and pays less. */
+static int pause_of(const double *x, const double *u, const double *p) {
     double scale[NX] = {0.0}, moved = 0.0, least = INFINITY;
     int slowest = MPC_HORIZON;
     for (int i = 0; i < MPC_HORIZON * NX; ++i) {
@@ -253,7 +253,13 @@ static int pause_of(const double *x) {
         for (int i = k * NX; i < (k + 1) * NX; ++i) moved += (x[i + NX] - x[i]) * (x[i + NX] - x[i]) * scale[i % NX];
         if (k > 0 && before + moved < least) least = before + moved, slowest = k;
     }
-    if (MPC_HORIZON < 3 || !(least < 2.0 * 0.01 * NX) || !(least < 2.0 * 0.25 * moved)) return MPC_HORIZON;
+    if (MPC_HORIZON < 3 || !(least < 2.0 * 0.25 * moved)) return MPC_HORIZON;
+    if (!(least < 2.0 * 0.01 * NX)) {
+        double there[NX + 1], at_end[NX + 1];
+        gen_step(x + slowest * NX, u + slowest * NU, p, there);
+        gen_step(x + MPC_HORIZON * NX, u + (MPC_HORIZON - 1) * NU, p, at_end);
+        if (!(there[NX] < at_end[NX])) return MPC_HORIZON;
+    }
     return slowest;
 }
 
@@ -287,7 +293,7 @@ int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[
     for (int a = 0; a < NU; ++a) u[a] = clip(state->u[a], low[a], high[a]);
     remember(state, u);
     /* The plan of the next step. */
-    int pause = pause_of(state->x);
+    int pause = pause_of(state->x, state->u, w.p);
     for (int i = 0; i < (pause < MPC_HORIZON ? pause : MPC_HORIZON - 1) * NU; ++i) state->u[i] = state->u[i + NU];
     for (int i = 0; i < pause * NX; ++i) state->x[i] = state->x[i + NX];
 #if LIMITS
