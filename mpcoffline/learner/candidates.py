@@ -198,6 +198,10 @@ def candidates_of(
         how["ready"] = _as_it_is if soft is None else soft
         return tried(nominal, known, between, table, variants, show, **how)
     mpcs = {FIRST: nominal, **between, FULL: known.mpc}
+    for turn in (1, 0, 1):  # a variant, and one of a variant
+        if learner.candidate not in mpcs:
+            alike = {name: mpc for name, mpc in mpcs.items() if learner.candidate.startswith(f"{name}, ")}
+            mpcs |= run.method.variants(known, alike, turn) if alike else {}
     found = Candidates(mpcs if soft is None else {name: soft(mpc) for name, mpc in mpcs.items()}, learner.candidate)
     _ = found.mpc  # refuses a name that is none of them
     return None if learner.candidate == FULL else found
@@ -208,7 +212,7 @@ def tried(
     known: Known,
     between: Mapping[str, MPC],
     table: TransitionTable,
-    variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]],
+    variants: Callable[[Mapping[str, MPC], int], Mapping[str, MPC]],
     tell: Callable[[int, int, str], None],
     *,
     polish: bool = False,

@@ -85,12 +85,13 @@ class Method(ABC):
         """
         return {}
 
-    def variants(self, known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
+    def variants(self, known: Known, mpcs: Mapping[str, MPC], turn: int) -> dict[str, MPC]:
         """What may be better than some of the candidates and is tried where these are good; by default nothing.
 
         Args:
             known: What is known at the end of the fit.
-            mpcs: The good ones, by name.
+            mpcs: The good ones, by name: after few starts the three best (turn 0), after more the best (turn 1).
+            turn: Which of the two it is.
         """
         return {}
 

@@ -21,13 +21,13 @@ _CLEAR = 2.0  # standard errors
 _TRIFLE = 0.01  # of the gain over MPC_1: what is better by less is no better
 _TOGETHER = 4  # MPCs whose closed loops are stepped together: much faster, and something is told in between
 _JUDGED = 3  # of the best at most, one after the other
-_VARIED = 3  # of the best, variants are tried
+_VARIED = (3, 1)  # of so many of the best, variants are tried after each of the first rounds
 
 
 def choose(
     mpcs: dict[str, MPC],
     around: Surroundings,
-    variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]] = lambda mpcs: {},
+    variants: Callable[[Mapping[str, MPC], int], Mapping[str, MPC]] = lambda mpcs, turn: {},
     tell: Callable[[int, int, str], None] = lambda *what: None,
     preferred: str = "",
 ) -> tuple[Trials, str]:
@@ -42,7 +42,7 @@ def choose(
     Args:
         mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
         around: Where they are tried; at most two thirds of its starts are used to choose.
-        variants: Of the three best after the first round these are tried, too.
+        variants: What is tried, too, of the three best after the first round (turn 0), of the best after the next (1).
         tell: Is told how many starts of how many are done, and what is tried.
         preferred: Which one is taken where it is as good as the best, but for a hundredth of the gain.
 
@@ -61,11 +61,11 @@ def choose(
             tell(starts.start, usual, ", ".join(some))
             trials.fill({name: policies[name] for name in some}, around, starts)
 
-    for end in ends:
+    for turn, end in enumerate(ends):
         act(left, slice(begin, end))
-        if begin == 0:  # what is better may be better still
-            good = _still_good(trials, left, end, preferred)[:_VARIED]
-            more = variants({name: mpcs[name] for name in good})
+        if turn < len(_VARIED):  # what is better may be better still
+            good = _still_good(trials, left, end, preferred)[: _VARIED[turn]]
+            more = variants({name: mpcs[name] for name in good}, turn)
             mpcs.update(more)
             policies.update({name: quick_policy(mpc) for name, mpc in more.items()})
             trials, left = trials.with_names(list(more)), [*left, *more]

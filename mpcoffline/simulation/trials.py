@@ -34,6 +34,7 @@ _ARRAYS = {
 }
 _NOISE = 7
 _SURE = 2.0  # standard errors
+_ROUNDING = 1e-12  # of what an episode costs
 _RUN_AWAY = 30.0  # spreads of the data: a state this far out has left what any model of them knows
 
 
@@ -126,12 +127,13 @@ class Trials:
         From all starts; those that had no part in the choice may not say otherwise beyond two standard errors.
         Where there is no difference at all, what was identified predicts the log better, and is taken.
         """
+        none = _ROUNDING * float(np.abs(self.of(self.names[0])[self.votes]).mean())
         for second in (False, True):
             gains = self.differences(name, second=second)[self.votes]
             middle = int(np.argsort(gains.mean(axis=1), kind="stable")[len(gains) // 2])
             fresh = gains[middle][self.judged]
             error = fresh.std() / np.sqrt(len(fresh)) if len(fresh) else 0.0
-            if not gains[middle].mean() <= 0.0 or (len(fresh) and fresh.mean() > _SURE * error):
+            if not gains[middle].mean() <= none or (len(fresh) and fresh.mean() > none + _SURE * error):
                 return False
         return True
 

@@ -82,6 +82,7 @@ def test_one_is_taken_by_name_and_nothing_is_tried() -> None:
     np.testing.assert_allclose(named.mpc.values["model.A"], lq_plant.A, atol=1e-3)
     with pytest.raises(UnknownIdError, match="identified, farther"):
         fitted(candidate="best")
+    assert fitted(candidate="full, undiscounted").mpc.to_json() == full.mpc.replace(discount=1.0).to_json()
 
 
 def test_the_published_recipe_never_chooses() -> None:
@@ -94,13 +95,16 @@ def test_what_is_asked_for_limits_the_candidates() -> None:
     far = fitted(horizon=17).candidates
     assert far is not None
     assert {mpc.horizon for name, mpc in far.items() if name != FIRST} == {17}
+    given = fitted(discount=0.9).candidates
+    assert given is not None
+    assert {mpc.discount for name, mpc in given.items() if name != FIRST} == {0.9}
     fixed = fitted(learn="cost").candidates
     assert fixed is not None
     for mpc in fixed.values():
         np.testing.assert_array_equal(mpc.values["model.A"], WRONG.values["model.A"])
     learned = fitted(stage_cost="fitted").candidates
     assert learned is not None
-    assert set(learned) == {FIRST, "fitted cost", FULL}
+    assert {name.removesuffix(", undiscounted") for name in learned} == {FIRST, "fitted cost", FULL}
 
 
 def test_the_same_seed_chooses_the_same(plain: OfflineMPCLearner) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import lq_plant
@@ -239,6 +240,13 @@ def test_variants_of_what_is_good_are_tried_too() -> None:
     around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 30)
     still, half = (lq_plant.make_mpc((share * lq_plant.A, lq_plant.B)) for share in (0.1, 0.5))
     mpcs = {FIRST: still, "half": half}
-    trials, chosen = choose(mpcs, around, lambda good: {f"{name}, whole": TRUE_MPC for name in good})
+    asked: list[tuple[list[str], int]] = []
+
+    def variants(good: Mapping[str, MPC], turn: int) -> dict[str, MPC]:
+        asked.append((list(good), turn))
+        return {f"{name}, whole": TRUE_MPC for name in good} if turn == 0 else {}
+
+    trials, chosen = choose(mpcs, around, variants)
     assert chosen == "half, whole"
     assert trials.names == tuple(mpcs) == (FIRST, "half", "half, whole")
+    assert asked == [(["half"], 0), (["half, whole"], 1)]

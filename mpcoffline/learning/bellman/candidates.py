@@ -62,6 +62,15 @@ def candidates(
     return found | fitted
 
 
+def undiscounted(mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
+    """Candidates that plan for what they are judged by: the cost of their steps without a discount.
+
+    A discount keeps V finite and small where little is known; to a plan of a given horizon it is of no use, and the
+    cost of an episode is not discounted.
+    """
+    return {f"{name}, undiscounted": mpc.replace(discount=1.0) for name, mpc in mpcs.items() if mpc.discount < 1.0}
+
+
 def with_learned_residual(known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
     """Candidates whose model is the identified one, with a learned residual where held-out episodes ask for one.
 

@@ -15,7 +15,7 @@ from mpcoffline.learning.stages import Change, Known, Stage
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.mpc import MPC
 
-from .candidates import candidates, with_learned_residual
+from .candidates import candidates, undiscounted, with_learned_residual
 from .limits import check_limit_parameters
 from .regression import ParameterConfig
 from .stages import (
@@ -78,9 +78,11 @@ class Bellman(Method):
         fixed = self.horizon is not None or self.discount is not None
         return candidates(known, self.terminal, fixed=fixed, only_fitted=self.cost.stage_cost == "fitted")
 
-    def variants(self, known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MPC]:
-        """Candidates with a learned residual, where held-out episodes ask for one."""
-        return with_learned_residual(known, mpcs)
+    def variants(self, known: Known, mpcs: Mapping[str, MPC], turn: int) -> dict[str, MPC]:
+        """Candidates with a learned residual, where held-out episodes ask for one; then the best one undiscounted."""
+        if turn == 0:
+            return with_learned_residual(known, mpcs)
+        return undiscounted(mpcs) if self.discount is None else {}
 
     def stages(self) -> dict[str, Stage | Change]:
         """Identification, (VALUE), (FIT), the terminal cost."""
