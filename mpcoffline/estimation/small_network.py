@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc.networks import random_layers
@@ -24,6 +25,8 @@ _NARROW = 0.1  # of the size that random_layers gives to the output layer: the f
 
 Layers = tuple[list[Array], list[Array]]  # weights and biases
 Rows = tuple[Array, Array, Array]  # inputs, unit of each output, targets
+Single = NDArray[np.float32]
+Places = NDArray[np.intp]
 
 
 class Effort(NamedTuple):
@@ -202,36 +205,60 @@ def _error(layers: Layers, z: Array, unit: Array, targets: Array) -> float:
 
 
 def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array, size: int) -> tuple[Array, Array, float]:
-    """J'J, J'(targets - y) and the squared error, per row; J by back-propagation, one output after the other."""
+    """J'J, J'(targets - y) and the squared error, per row.
+
+    A layer's part of a row of J is an outer product, of what back-propagation gives for an output o and the layer's
+    input, ``d_o v'``. So nothing needs J: of two layers, with sums over outputs before those over rows::
+
+        J_l'J_k = sum_rows (sum_o d_lo d_ko') x (v_l v_k')
+    """
     weights, biases = layers
     signals, slopes = _signals(weights, biases, z)
     missed = targets - unit * signals[-1]
+    n, single = len(z), np.float32
+    last = (unit * slopes[2]).astype(single)
+    second = last[:, :, None] * weights[2].astype(single) * slopes[1].astype(single)[:, None, :]
+    first = (second @ weights[1].astype(single)) * slopes[0].astype(single)[:, None, :]
+    back, inputs = (first, second), [np.hstack([v, np.ones((n, 1))], dtype=single) for v in signals[:3]]
+    places = _places(weights, biases)
     curvature, slope = np.zeros((size, size)), np.zeros(size)
-    n_weights = sum(A.size for A in weights)
-    for o in range(targets.shape[1]):
-        to_a = unit[:, o] * slopes[2][:, o]
-        to_second = to_a[:, None] * weights[2][o] * slopes[1]
-        to_first = (to_second @ weights[1]) * slopes[0]
-        blocks = [
-            (to_first[:, :, None] * signals[0][:, None, :]).reshape(len(z), -1),
-            (to_second[:, :, None] * signals[1][:, None, :]).reshape(len(z), -1),
-            to_a[:, None] * signals[2],
-            to_first,
-            to_second,
-            to_a[:, None],
-        ]
-        n_0, n_1, _ = (A.size for A in weights)
-        m_0, m_1 = biases[0].size, biases[1].size
-        width = weights[2].shape[1]
-        places = np.concatenate(
+
+    def summed(d: Single, v: Single, w: Single) -> Single:
+        """``sum_rows d v w'``, (entries of d, of v, of w)."""
+        outer = (v[:, :, None] * w[:, None, :]).reshape(n, -1)
+        return (d.reshape(n, -1).T @ outer).reshape(-1, v.shape[1], w.shape[1])
+
+    def put(rows: Places, columns: Places, block: Single) -> None:
+        curvature[np.ix_(rows, columns)] = block
+        curvature[np.ix_(columns, rows)] = block.T
+
+    for i, k in ((0, 0), (0, 1), (1, 1)):
+        blocks = summed(back[i].transpose(0, 2, 1) @ back[k], inputs[i], inputs[k])
+        shape = back[i].shape[2], back[k].shape[2], *blocks.shape[1:]
+        block = blocks.reshape(shape).transpose(0, 2, 1, 3).reshape(places[i].size, places[k].size)
+        put(places[i].ravel(), places[k].ravel(), block)
+    own = summed(last**2, inputs[2], inputs[2])
+    across = [summed(last[:, :, None] * d, v, inputs[2]) for d, v in zip(back, inputs, strict=False)]
+    for o, mine in enumerate(places[2]):
+        put(mine, mine, own[o])
+        for theirs, blocks in zip(places, across, strict=False):
+            put(theirs.ravel(), mine, blocks.reshape(len(places[2]), theirs.size, len(mine))[o])
+    off = missed.astype(single)
+    for d, v, where in zip((*back, None), inputs, places, strict=True):
+        pulled = last * off if d is None else (off[:, None, :] @ d)[:, 0]
+        slope[where] = pulled.T @ v
+    return curvature / n, slope / n, float(np.sum(missed**2) / n)
+
+
+def _places(weights: list[Array], biases: list[Array]) -> list[Places]:
+    """Where the entries of each layer's ``[A, b]`` are in the flat vector of all weights and biases."""
+    ends, sizes = np.cumsum([A.size for A in weights]), np.cumsum([b.size for b in biases])
+    return [
+        np.hstack(
             [
-                np.arange(n_0 + n_1),
-                n_0 + n_1 + o * width + np.arange(width),
-                n_weights + np.arange(m_0 + m_1),
-                [n_weights + m_0 + m_1 + o],
+                np.arange(end - A.size, end).reshape(A.shape),
+                ends[-1] + np.arange(stop - b.size, stop)[:, None],
             ]
         )
-        J = np.concatenate(blocks, axis=1, dtype=np.float32)
-        curvature[np.ix_(places, places)] += J.T @ J
-        slope[places] += J.T @ missed[:, o].astype(np.float32)
-    return curvature / len(z), slope / len(z), float(np.sum(missed**2) / len(z))
+        for A, b, end, stop in zip(weights, biases, ends, sizes, strict=True)
+    ]
