@@ -20,7 +20,8 @@ from mpcoffline.core.tables import Table
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learner.learner import OfflineMPCLearner
-from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
+from mpcoffline.mpc import MPC, Block, Model, NormCost, Parameter, ParameterSpace, QuadraticCost
+from mpcoffline.mpc.expression_cost import ExpressionCost
 from mpcoffline.plants import nominal_mpc
 
 
@@ -85,8 +86,11 @@ class Units:
         return np.broadcast_to(self.states, mpc.nx), np.broadcast_to(self.inputs, mpc.nu)
 
     def _cost(self, cost: Any, x: Array, u: Array) -> Any:
-        if type(cost) is NormCost and len(set(x)) == 1:  # of states of one unit
-            return NormCost(x * cost.values["x_ref"], float(x[0]) * cost.eps)
+        if type(cost) is NormCost:  # which has no weights that could take the units
+            space = ParameterSpace([Block.free("x_ref", x * cost.values["x_ref"], "reference")])
+            state, reference = ca.SX.sym("x", len(x)), ca.SX.sym("p", len(x))
+            norm = ca.sqrt(ca.sumsqr((state - reference) / x) + cost.eps**2) - cost.eps
+            return ExpressionCost(ca.Function("norm", [state, reference], [self.cost * norm]), space, convex=True)
         if not isinstance(cost, QuadraticCost):
             return cost
         old = cost.values

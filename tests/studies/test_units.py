@@ -22,6 +22,8 @@ def test_an_mpc_in_other_units_moves_and_costs_the_same(plant: str) -> None:
     np.testing.assert_allclose(scaled.model(1e3 * x, 1e-2 * u), 1e3 * mpc.model(x, u), rtol=1e-6, atol=1e-6)
     costs = [float(p.stage_function(*z, p.theta)) for p, z in ((mpc, (x, u)), (scaled, (1e3 * x, 1e-2 * u)))]
     assert costs[1] == pytest.approx(1e6 * costs[0], rel=1e-9)
+    ends = [float(p.terminal_function(z, p.theta)) for p, z in ((mpc, x), (scaled, 1e3 * x))]
+    assert ends[1] == pytest.approx(1e6 * ends[0], rel=1e-9)
     assert scaled.model.dt == 60.0 * mpc.model.dt
 
 
