@@ -265,14 +265,14 @@ def _of_today(today: Today, trials: Trials, name: str) -> tuple[str, ...]:
             f"{name} is worse than {logged}: {span} an episode, whether by the log or by a clone.{also} Keep"
             " what runs today.",
         )
-    if np.isfinite(today.disagreement).any():
-        gap = float(np.nanmedian(today.disagreement))
+    gap = float(np.nanmedian(today.disagreement)) if np.isfinite(today.disagreement).any() else 0.0
+    if abs(gap) > 0.5 * (high - low):
         why = (
-            f"on the models a clone of that controller costs {figure(gap, sign=True)} of what was logged. A model that"
-            " explains this would decide"
+            f"on the models a clone of that controller costs {figure(abs(gap))} {'more' if gap > 0.0 else 'less'} than"
+            " what was logged. A model that explains this would decide"
         )
     else:
-        why = "more episodes in the log would decide"
+        why = "the episodes differ too much from each other: more of them in the log, or a trial, would decide"
     rather = " It is rather worse." if today.dearer else ""
     return (f"{name} against {logged}: {span} an episode, which is not clear; {why}.{rather}{also}",)
 

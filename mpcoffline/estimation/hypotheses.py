@@ -308,8 +308,9 @@ def _best(scores: list[float], names: list[str], most: int) -> list[int]:
     return found[:most]
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _fitted(predicted: Array, r: Reading) -> Array:
-    """What a gain, not below zero, and an offset leave of the predicted motion, ``(m, n)``."""
+    """What a gain, not below zero, and an offset leave of the predicted motion, ``(m, n)``; NaN where that explodes."""
     motion, own = (part - r.x for part in (r.reached, predicted))
     motion, own = motion - motion.mean(axis=0), own - own.mean(axis=0)
     power = (own**2).sum(axis=0)

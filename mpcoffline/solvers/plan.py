@@ -113,6 +113,7 @@ class Plan(tuple[Array, ...]):
         return Plan(*arrays)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a plan that explodes waits nowhere
 def pauses(
     x: Array, cheaper: Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]] | None = None
 ) -> NDArray[np.intp]:

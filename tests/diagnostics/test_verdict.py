@@ -128,9 +128,13 @@ def test_what_is_better_than_today_is_told() -> None:
 def test_within_the_disagreement_of_models_and_log_nothing_is_recommended() -> None:
     found, why = judge(trials({"learned": BETTER}, today=75.0, clone=120.0, noise=0.01))
     assert found == "try with care"
-    assert "which is not clear; on the models a clone of that controller costs +45 of what was logged" in why
+    assert "which is not clear; on the models a clone of that controller costs 45 more than what was logged" in why
     found, why = judge(trials({"learned": BETTER}, today=95.0, clone=60.0))
     assert found == "try with care"
+    assert "costs 35.1 less than what was logged" in why
+    found, why = judge(trials({"learned": BETTER}, today=81.0, clone=81.0, noise=20.0))
+    assert found == "try with care"
+    assert "the episodes differ too much from each other: more of them in the log" in why
 
 
 def test_one_runaway_in_the_log_does_not_make_today_unclear() -> None:
