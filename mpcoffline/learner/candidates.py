@@ -17,7 +17,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.back_offs import BackOffs, backed_off
-from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy
+from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy, various_first
 from mpcoffline.simulation.polishing import polished
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
@@ -237,6 +237,7 @@ def tried(
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
     slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
     around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
+    around = various_first(around, mpcs[FIRST])
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
     if polish:
         better, name = polished(mpcs[chosen], around, known.seed, tell), f"{chosen}, polished"

@@ -89,6 +89,28 @@ def choose(
     return trials.judged_from(begin), chosen
 
 
+def various_first(around: Surroundings, mpc: MPC) -> Surroundings:
+    """The same with the usual starts in an order of which each beginning is as various as the whole.
+
+    Controllers often differ by rare starts alone, from which one swings up and another never does. Early rounds would
+    not see them, and take for no better what is. So the starts are sorted by what they cost under an MPC, and taken
+    from the dearest on in the order of van der Corput: then the middle, then the quarters, and so on.
+
+    Args:
+        around: Where controllers are tried.
+        mpc: By whose cost on the median model starts are sorted.
+    """
+    if not around.models.votes.any():
+        return around
+    (done,) = around.act([quick_policy(mpc)], slice(0, around.usual))
+    cost = np.median(done.cost[around.models.votes], axis=0)
+    dearest = np.argsort(-np.where(np.isnan(cost), np.inf, cost), kind="stable")
+    digits = max(1, (len(cost) - 1).bit_length())
+    reversed_digits = [int(f"{i:0{digits}b}"[::-1], 2) for i in range(len(cost))]
+    order = dearest[np.argsort(reversed_digits)]
+    return around.reordered(np.append(order, np.arange(around.usual, len(around.rows))))
+
+
 def are_slow(policies: Iterable[MPCPolicy]) -> bool:
     """Whether one of them has a slow solver, as ipopt."""
     return min(policy.solver.relative_speed for policy in policies) < _SLOW

@@ -240,6 +240,14 @@ class Surroundings:
         other.models, other.disturbances = self.models.some(models), self.disturbances[models]
         return other
 
+    def reordered(self, order: NDArray[np.intp]) -> Surroundings:
+        """The same with its starts in another order, ``(starts,)``."""
+        other = copy.copy(self)
+        for name in ("rows", "before", "starts", "signals", "returns", "begun"):
+            setattr(other, name, getattr(self, name)[order])
+        other.disturbances, other.noise = self.disturbances[:, order], self.noise[:, order]
+        return other
+
     def begun_at(self, starts: Array, signals: Array) -> Surroundings:
         """The same models and disturbances from other starts, under other signals.
 

@@ -20,7 +20,7 @@ from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.estimation import identify
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC
-from mpcoffline.simulation.choice import FIRST, choose
+from mpcoffline.simulation.choice import FIRST, choose, various_first
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
 from mpcoffline.simulation.starts import costs_before, initial_rows, returns_along
@@ -234,6 +234,28 @@ def test_the_best_of_some_is_chosen_and_the_worse_leave_early() -> None:
     assert np.isnan(trials.of("lazy")).any()
     assert choose({FIRST: TRUE_MPC, "wrong": wrong}, around)[1] == FIRST
     assert choose({FIRST: TRUE_MPC, "same": TRUE_MPC.replace(horizon=TRUE_MPC.horizon)}, around)[1] == "same"
+
+
+def test_each_beginning_of_the_starts_is_as_various_as_the_whole() -> None:
+    around = place(TRUE_MPC, LOG, list(range(0, 600, 35))[:16], 30)
+    (plain,) = around.act([MPCPolicy(TRUE_MPC)])
+    sorted_ = various_first(around, TRUE_MPC)
+    (done,) = sorted_.act([MPCPolicy(TRUE_MPC)])
+    order = np.array([np.flatnonzero(around.rows == row)[0] for row in sorted_.rows])
+    np.testing.assert_allclose(done.cost, plain.cost[:, order], rtol=1e-9)
+    np.testing.assert_array_equal(sorted_.returns, around.returns[order])
+    rank = np.argsort(np.argsort(-np.median(plain.cost, axis=0)[order]))
+    assert rank[0] == 0  # the dearest one
+    for n in (2, 4, 8):
+        assert sorted(rank[:n] // (16 // n)) == list(range(n))
+
+
+def test_starts_that_are_spared_stay_at_the_end() -> None:
+    around = place(TRUE_MPC, LOG, list(range(0, 600, 30)), 30)
+    around.usual = 5
+    found = various_first(around, TRUE_MPC)
+    np.testing.assert_array_equal(found.rows[5:], around.rows[5:])
+    assert sorted(found.rows[:5]) == sorted(around.rows[:5])
 
 
 def test_variants_of_what_is_good_are_tried_too() -> None:
