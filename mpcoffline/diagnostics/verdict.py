@@ -116,7 +116,8 @@ def _costs(trials: Trials, name: str, first: Difference, k: int) -> Array:
 def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
     """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts.
 
-    And what the median model lets expect less what it said too much of the controller that made the log.
+    And what the median model lets expect by the other regression of the cost, and less what it said too much of the
+    controller that made the log.
     """
     costs = trials.of(proposal)[trials.votes][:, whole_episodes(trials)]
     mean, error = paired(costs, np.zeros_like(costs))
@@ -126,7 +127,9 @@ def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
     order, out = np.sort(mean[known]), outvoted(int(known.sum()))
     kept, doubt = order[out : len(order) - out], SURE * float(np.median(error[known]))
     ends = [float(kept[0]) - doubt, float(kept[-1]) + doubt]
-    middle = float(np.median(order))
+    middle, second = float(np.median(order)), trials.second[trials.names.index(proposal)][trials.votes]
+    other = np.median(paired(second[:, whole_episodes(trials)], np.zeros_like(costs))[0][known])
+    ends += [float(other) - doubt, float(other) + doubt] if np.isfinite(other) else []
     today = Today.of(trials, proposal)
     off = np.flatnonzero(np.isfinite(today.disagreement) & np.isfinite(today.disagreement_error))
     if len(off):
