@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -161,6 +162,7 @@ class OfflineMPCLearner:
                 raise InvalidArgumentError("candidate", expected=f"'auto' with {name}", actual=repr(candidate))
         self.soften, self.keep_limits = check_soften(soften), keep_limits
         self.softening: Softening | None = None
+        self.start: MPC | None = None  # of the last fit
         self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
@@ -210,6 +212,7 @@ class OfflineMPCLearner:
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
         also: Mapping[str, MPC] | None = None,
+        start: MPC | None = None,
     ) -> History:
         """Learns, stage by stage: by all presets V_phi, then theta.
 
@@ -229,6 +232,8 @@ class OfflineMPCLearner:
                 ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
             also: Further MPCs of this plant by name, as one that runs already: candidates beside what is learned.
+            start: An MPC that was learned before, as from a part of the data: identification begins there, too, and
+                ends at the better minimum. What the data leave open stays near the given values.
 
         Returns:
             ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
@@ -250,6 +255,7 @@ class OfflineMPCLearner:
             checkpoint=checkpoint,
             show_progress=show_progress,
             also=also,
+            start=start,
         ):
             pass
         return self.history
@@ -265,6 +271,7 @@ class OfflineMPCLearner:
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
         also: Mapping[str, MPC] | None = None,
+        start: MPC | None = None,
     ) -> Iterator[tuple[int, dict[str, float]]]:
         """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
         begun = core_seconds()
@@ -282,6 +289,7 @@ class OfflineMPCLearner:
         for finding in report.warnings:
             logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
+        self.start, known = start, replace(known, start=start)
         self.softening = Softening.of(self.nominal_mpc, table, self.seed) if self.soften else None
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)

@@ -45,6 +45,7 @@ class Order:
         sections: Further parts of the page.
         today: How many episodes, the first ones, were made by the controller that runs today; all by default.
         doubt: Why nothing may be recommended whatever the models say; empty where nothing speaks against it.
+        start: What was learned before, where identification begins, too.
     """
 
     plant: str
@@ -56,6 +57,7 @@ class Order:
     sections: Sequence[Section] = ()
     today: int | None = None
     doubt: str = ""
+    start: MPC | None = None
 
 
 def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> dict[str, Any]:
@@ -123,7 +125,7 @@ def _learner(order: Order, path: Path, tell: Tell, show_progress: bool) -> Offli
     checkpoint = path / CHECKPOINT
     tell("Fitting" + (", from where it was interrupted" if checkpoint.is_file() else ""))
     learner = OfflineMPCLearner(order.mpc, **order.options)
-    learner.fit(order.table, checkpoint=checkpoint, show_progress=show_progress, also=order.also)
+    learner.fit(order.table, checkpoint=checkpoint, show_progress=show_progress, also=order.also, start=order.start)
     learner.save(file)
     return learner
 

@@ -16,11 +16,11 @@ from mpcoffline.datasets.logs.wanted import Wanted
 from mpcoffline.datasets.table.files import hash_of
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
+from mpcoffline.diagnostics.trial import Band, Calibration, compared
 from mpcoffline.simulation.choice import FIRST
 
 from .folder import PLANT, RUN, Workplace, identity_of, read_run
 from .making import RUNNING, Order, Tell, made
-from .trial import Band, Calibration, compared
 from .tuned import Tuned, item
 
 _DOUBT = (
@@ -57,7 +57,8 @@ def retune(
     """Compares a trial with what was predicted for it, and learns from both logs.
 
     The plant file is not run again: what reads logs and what a step costs stands in the folder. The controller of the
-    trial is a candidate beside what is learned now, so that it is handed out again where nothing is better. The folder
+    trial is a candidate beside what is learned now, so that it is handed out again where nothing is better; and
+    identification begins at the model that was learned before, too. The folder
     is replaced as a whole; what it held is kept in a numbered folder inside. A trial that it has learned from already
     changes nothing.
 
@@ -104,7 +105,7 @@ def retune(
     also = {} if before.document["policy"] == FIRST else {RUNNING: running}
     sections = [_section(calibration, history), _read_section(table)]
     reader_json, doubt = _reader_json(before), _DOUBT if calibration.far else ""
-    order = Order(name, reader_json, learner.nominal_mpc, both, options, also, sections, today, doubt)
+    order = Order(name, reader_json, learner.nominal_mpc, both, options, also, sections, today, doubt, learner.mpc)
     document = made(order, place, tell, show_progress=show_progress)
     kept = {key: before.document[key] for key in ("check", "read") if key in before.document}
     document |= kept | {"trials": history, "today": today}

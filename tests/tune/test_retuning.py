@@ -16,8 +16,8 @@ from mpcoffline import FileFormatError, MPCPolicy
 from mpcoffline.cli import app
 from mpcoffline.datasets.logs.wanted import Wanted
 from mpcoffline.diagnostics import diagnose
+from mpcoffline.diagnostics.trial import TODAY, TRIED
 from mpcoffline.tune import Calibration, Tuned, retune, tune
-from mpcoffline.tune.trial import TODAY, TRIED
 
 pytest.importorskip("polars")
 

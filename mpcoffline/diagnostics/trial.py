@@ -15,7 +15,6 @@ from mpcoffline.core.text import figure
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.diagnostics.differences import SURE, outvoted
 from mpcoffline.estimation import Identification
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
@@ -25,6 +24,8 @@ from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.starts import returns_along, signals_along
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Controller, Surroundings
+
+from .differences import SURE, outvoted
 
 TRIED, TODAY = "the controller of the trial", "today's controller (clone)"
 _WINDOWS, _LOOPS = 32, 96  # stretches of the trial, closed loops on a model in all
@@ -207,7 +208,8 @@ def compared(
     layout, nominal = learned.layout, given.with_delay(learned.layout.delay)
     table, tried = with_memory(log, layout), with_memory(trial, layout)
     known = None if learner.result is None else learner.result.cost
-    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    rows = as_logged(learned, table, known)
+    found, clean = identify_as_logged(nominal, table, rows, seed=seed, start=learner.start)
     policies = {TRIED: quick_policy(running), FIRST: quick_policy(given)}
     slow = are_slow(policies.values())
     around, starts = _surroundings(learned, given, (log, table, clean), tried, found, slow, seed + _TRIAL)
