@@ -13,7 +13,7 @@ from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.tables import Table
 from mpcoffline.core.types import Array
 from mpcoffline.learner.candidates import FULL
-from mpcoffline.learner.learner import OfflineMPCLearner
+from mpcoffline.learner.learner import Learn, OfflineMPCLearner
 
 from .plant_files import PlantFile
 from .zoo import NAN, Case, Found, heard, noted, paired, short_text
@@ -111,7 +111,8 @@ def _fill(found: Found, case: Case, tell: Callable[[str], None]) -> None:
     if truth is not None:
         cost("yardstick", MPCPolicy(truth))
     tell(f"fit of {len(log)} transitions, polished")
-    learn, said = getattr(plant.module, "LEARN", "cost+model"), list[str]()
+    learn: Learn = getattr(plant.module, "LEARN", "cost+model")
+    said: list[str] = []
     learner = OfflineMPCLearner(nominal, learn=learn, seed=seed, polish=True)
     with heard(said, "INFO"):
         learner.fit(log, show_progress=False)

@@ -15,7 +15,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.trial import compared
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.learner.effort import core_seconds
-from mpcoffline.learner.learner import OfflineMPCLearner
+from mpcoffline.learner.learner import Learn, OfflineMPCLearner
 
 from .plant_files import PlantFile
 from .zoo import CLOSE, MARGIN, NAN, Found, noted, paired
@@ -151,7 +151,7 @@ def _fill(found: Found, case: Case, tell: Callable[[str], None]) -> None:
     nominal, truth = plant.module.mpc(seed), plant.module.truth()
     cost("mpc_1", MPCPolicy(nominal))
     best = None if truth is None else cost("yardstick", MPCPolicy(truth))
-    learn = getattr(plant.module, "LEARN", "cost+model")
+    learn: Learn = getattr(plant.module, "LEARN", "cost+model")
     learner, again = (OfflineMPCLearner(nominal, learn=learn, seed=seed) for _ in range(2))
     tell(f"fit of {len(log)} transitions")
     begun = core_seconds()
