@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from .checks import check_integers
 from .executors import EXECUTORS, Executor, JobError, is_at_work, n_cpus
@@ -14,7 +15,7 @@ __all__ = ["EXECUTORS", "SETTING", "Executor", "JobError", "chosen", "map", "n_c
 SETTING = "MPCOFFLINE_EXECUTOR"  # an environment variable
 
 
-def chosen(name: str | None = None, default: str = "processes") -> type[Executor[Job, Result]]:
+def chosen(name: str | None = None, default: str = "processes") -> type[Executor[Any, Any]]:
     """Where jobs are done: where is asked for, else where ``$MPCOFFLINE_EXECUTOR`` says, else by default.
 
     What a worker does is done in it, whatever anybody asks for: workers have none of their own.
