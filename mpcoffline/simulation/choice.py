@@ -67,7 +67,7 @@ def _chosen(
     trials: Trials,
     mpcs: dict[str, MPC],
     around: Surroundings,
-    variants: Callable[[Mapping[str, MPC]], Mapping[str, MPC]],
+    variants: Callable[[Mapping[str, MPC], int], Mapping[str, MPC]],
     stage: Stage,
     preferred: str,
 ) -> tuple[Trials, str]:
