@@ -153,6 +153,8 @@ def learn(
         say(escape(finding))
     if learner.candidates is not None:
         say(escape(str(learner.candidates)))
+        if learner.candidates.effort is not None and polish:
+            console.print(learner.candidates.effort.table)
     say_file("Learner", out)
     say_file("Policy", policy_file)
     env_id = data.spec.env_spec.id if data.spec.env_spec is not None else "ENV_ID"

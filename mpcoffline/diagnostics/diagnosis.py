@@ -110,7 +110,7 @@ def diagnose(
     logged = TransitionTable.of(dataset)
     table = with_memory(logged, learned.layout)
     known = None if learner.result is None else learner.result.cost
-    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed, start=learner.start)
     identified = nominal.replace(model=found.model)
     around = surroundings_of(
         learned,

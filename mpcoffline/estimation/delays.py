@@ -16,7 +16,8 @@ from mpcoffline.datasets.table.memory import rows_before
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .identification import FULL_TURN, OneStepProblem, Rows, without_jumps
+from .identification import OneStepProblem
+from .rows import FULL_TURN, Rows, without_jumps
 
 _ROWS = 6_000  # of the log that are looked at
 _FEW_ROWS = 1_000  # of them, for a descent

@@ -23,7 +23,8 @@ from mpcoffline.mpc.scaling import increments_scale
 
 from .findings import Excerpt, Finding, nominal_costs
 from .guesses import LONGER, Guess, Reading, every_guess, sampled
-from .identification import OneStepProblem, Rows, without_jumps
+from .identification import OneStepProblem
+from .rows import Rows, without_jumps
 
 _ROWS = 240
 _FEW = 60

@@ -24,15 +24,13 @@ from mpcoffline.mpc.scaling import Scaling, increments_scale
 
 from .one_step import OneStep
 from .plant import plant_rows
+from .rows import Rows, without_jumps
 from .uncertainty import Misfit, clusters, uncertainty
 
 logger = logging.getLogger(__name__)
 
-FULL_TURN = 2.0 * np.pi
 #: Spreads of the increments: what a prediction that is not finite counts, and from where on errors count by less.
 ABSURD = 1e3
-_NEAR_TURN = 0.5  # rad
-_MOST_TURNS = 10  # a step; beyond 1e16, every number is one of full turns
 _AT_BOUND = 1e-4  # in scaled coordinates
 _WEAKEST_PRIOR = 1e-10
 _FEW_ROWS = 1_000  # for the way to the minimum
@@ -118,14 +116,6 @@ class OneStepIdentification:
         if self.absurd[0]:
             text = "The model's predictions of %d of %d rows are absurd or not finite: is it right there, are the data?"
             logger.warning(text, *self.absurd)
-
-
-class Rows(NamedTuple):
-    """The transitions used, in float64."""
-
-    x: Array
-    u: Array
-    reached: Array
 
 
 class _Descent(NamedTuple):
@@ -270,9 +260,14 @@ def identify_one_step(
 
 
 def identify_plant(
-    mpc: MPC, table: TransitionTable, config: IdentificationConfig | None = None, *, seed: int = 0
+    mpc: MPC,
+    table: TransitionTable,
+    config: IdentificationConfig | None = None,
+    *,
+    seed: int = 0,
+    start: Array | None = None,
 ) -> OneStepIdentification:
-    """As :func:`identify_one_step`, from a table of :func:`plant_rows`."""
+    """As :func:`identify_one_step`, from a table of :func:`plant_rows`; the search begins at theta ``start``, too."""
     config = config or IdentificationConfig()
     rng = np.random.default_rng(seed)
     centre = table.centring.centre[: table.ny]
@@ -283,7 +278,7 @@ def identify_plant(
         problem = OneStepProblem(mpc, rows, centre)
     if not problem.free.size:
         return described(mpc, problem, np.zeros(0), Misfit.nothing(), config.prior_spread, unwrapped)
-    z, prior = _best_descent(problem, config, rng)
+    z, prior = _best_descent(problem, config, rng, None if start is None else problem.z(start))
     variance = len(problem.rows.x) * prior * config.prior_spread**2
     found = described(mpc, problem, z, _misfit(problem, z, variance, episodes), config.prior_spread, unwrapped)
     if found.absurd[0] == len(rows.x):
@@ -348,27 +343,13 @@ def _rows(
     return Rows(*(np.asarray(part, dtype=np.float64) for part in parts)), sample.episode_ids
 
 
-def without_jumps(rows: Rows, errors: Array) -> tuple[Rows, tuple[int, ...]]:
-    """The rows with full turns removed from s+ in wrapped angles, and which coordinates these are.
-
-    These are confined to one turn, and their prediction errors are either small or near a full turn.
-    """
-    turns = np.round(np.nan_to_num(errors) / FULL_TURN)
-    jumps = turns != 0.0
-    near = (np.abs(errors - FULL_TURN * turns) < _NEAR_TURN) & (np.abs(turns) <= _MOST_TURNS)
-    confined = np.ptp(np.concatenate([rows.x, rows.reached]), axis=0) <= 1.05 * FULL_TURN
-    count = jumps.sum(axis=0)
-    wrapped = confined & (count > 0) & ((jumps & near).sum(axis=0) >= 0.9 * count)
-    reached = rows.reached + np.where(wrapped & jumps, FULL_TURN * turns, 0.0)
-    return rows._replace(reached=reached), tuple(int(i) for i in np.flatnonzero(wrapped))
-
-
 def _best_descent(
-    problem: OneStepProblem, config: IdentificationConfig, rng: np.random.Generator
+    problem: OneStepProblem, config: IdentificationConfig, rng: np.random.Generator, begin: Array | None = None
 ) -> tuple[Array, float]:
     """The minimum and the weight of its prior: found on few rows, refined on all.
 
-    It starts again from elsewhere where the first start ends at a bound or explains nothing.
+    It begins at theta_0, and at a point that is given; again from elsewhere where the first start ends at a bound or
+    explains nothing.
     """
     n, n_coordinates = problem.rows.x.shape
     few = problem.on(Rows(*(part[:: max(1, n // _FEW_ROWS)] for part in problem.rows)))
@@ -378,6 +359,8 @@ def _best_descent(
         return float(max(_WEAKEST_PRIOR, mean_square / n_coordinates / n) / config.prior_spread**2)
 
     start, best = np.zeros(len(problem.free)), _Descent(np.zeros(len(problem.free)), np.inf)
+    if begin is not None:
+        best = few.descend(begin, weight(1.0), config.max_iterations)
     for _ in range(config.restarts + 1):
         best = min(best, few.descend(start, weight(1.0), config.max_iterations), key=attrgetter("cost"))
         if best.cost < n_coordinates and not _at_bound(problem, best.z).any():

@@ -16,13 +16,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC, Model
 
 from .episodes import EpisodeSpread, by_episode
-from .identification import (
-    IdentificationConfig,
-    OneStepIdentification,
-    OneStepProblem,
-    described,
-    identify_plant,
-)
+from .identification import IdentificationConfig, OneStepIdentification, OneStepProblem, described, identify_plant
 from .kalman import Filtered, filtered, smoothed
 from .multi_step import MultiStepProblem, Windows
 from .plant import plant_rows, state_rows
@@ -76,6 +70,7 @@ def identify(
     horizon: int | None = None,
     tried: Sequence[str] = (),
     seed: int = 0,
+    start: MPC | None = None,
 ) -> Identification:
     """Identifies the model from a log, and takes the measurement noise out of the log.
 
@@ -110,6 +105,8 @@ def identify(
         horizon: Steps that are predicted in the fit; None for one, 10 to 25 for output error.
         tried: What of the model's structure was varied before, in words: the check of structure repeats it.
         seed: Seeds the choice of rows and the restarts.
+        start: An MPC that was learned before: the search begins at its model's parameters, too; the prior stays about
+            theta_0.
 
     Returns:
         Parameters with deviations, smoothed data and noise; theta_0 itself for a model without parameters.
@@ -125,7 +122,7 @@ def identify(
     # Rows may have been left out since it was chosen.
     mpc = mpc.replace(model=mpc.model.suited_to_log(whole, finer=True))
     for _ in range(_ROUNDS):
-        found = _identified(mpc, rows, config, horizon, seed)
+        found = _identified(mpc, rows, config, horizon, seed, start)
         model = found.model.suited_to_log(whole, finer=True)
         if model.scheme == found.model.scheme:
             break
@@ -152,8 +149,22 @@ def _checked(
     return check_structure(mpc, few, source.episode_ids, found.theta, spread=config.prior_spread, seed=seed)
 
 
+def _beginning(mpc: MPC, start: MPC) -> Array:
+    """Theta with the model's parameters of another MPC, as far as it has them."""
+    known, theta = {block.name: block for block in start.space if block.group == "model"}, mpc.theta
+    for block in mpc.space:
+        if block.group == "model" and block.name in known and known[block.name].theta.shape == block.theta.shape:
+            theta[mpc.space.slices[block.name]] = known[block.name].theta
+    return np.asarray(np.clip(theta, mpc.space.low, mpc.space.high))
+
+
 def _identified(
-    mpc: MPC, table: TransitionTable, config: IdentificationConfig, horizon: int | None, seed: int
+    mpc: MPC,
+    table: TransitionTable,
+    config: IdentificationConfig,
+    horizon: int | None,
+    seed: int,
+    start: MPC | None = None,
 ) -> Identification:
     """As :func:`identify`, from a table of :func:`plant_rows`, with the model integrated as it is."""
 
@@ -164,7 +175,8 @@ def _identified(
         model = mpc.with_theta(found.theta).model
         return Identification(**vars(found), table=table, noise=noise, model=model, episode_spread=spread)
 
-    first = identify_plant(mpc, table, config, seed=seed)
+    begin = None if start is None else _beginning(mpc, start)
+    first = identify_plant(mpc, table, config, seed=seed, start=begin)
     source = excerpt(table, EXCERPT, seed)
     few = Trajectories.of(mpc, source, first.unwrapped).thinned(FEW_ROWS, seed)
     noise = noise_by_moments(few, first.theta)

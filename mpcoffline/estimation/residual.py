@@ -18,9 +18,10 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
-from .identification import OneStepProblem, Rows, without_jumps
+from .identification import OneStepProblem
 from .multi_step import Windows, open_loop
 from .plant import plant_rows
+from .rows import Rows, without_jumps
 from .small_network import Effort, SmallNetwork, fit_small_network
 from .structure import HeldOut, clearly_negative
 from .trajectories import Trajectories

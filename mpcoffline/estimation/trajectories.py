@@ -13,9 +13,10 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.scaling import increments_scale, spread_of
 
-from .identification import ABSURD, Rows
+from .identification import ABSURD
 from .kalman import Linearised
 from .one_step import OneStep
+from .rows import Rows
 
 _LENGTHS = (200, 100, 50, 25, 12)  # steps that a trajectory may have; longer ones are cut and filtered side by side
 _CUT = 1e-3  # share of the pairs of measurements of one state that may be taken for a gap

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,11 @@ from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.back_offs import BackOffs, backed_off
 from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy, various_first
-from mpcoffline.simulation.polishing import polished
+from mpcoffline.simulation.polishing import Kept, polished
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
+
+from .effort import Effort, core_seconds
 
 if TYPE_CHECKING:
     from mpcoffline.core.progress import Bars
@@ -52,12 +54,15 @@ class Candidates(Mapping[str, MPC]):
         chosen: The one that the learner hands out.
         trials: Their closed loops on models of the log; None where one was taken by name.
         back_offs: How the limits of the chosen one were made tighter, where that was asked for.
+        effort: What regressions, choice and search each gain, and how long they took; None where one was taken by name,
+            and in what was read from a file.
     """
 
     mpcs: Mapping[str, MPC]
     chosen: str
     trials: Trials | None = None
     back_offs: BackOffs | None = None
+    effort: Effort | None = field(default=None, compare=False)
 
     def __getitem__(self, name: str) -> MPC:
         """The MPC of a name.
@@ -180,9 +185,24 @@ def check_also(nominal: MPC, also: Mapping[str, MPC]) -> None:
 
 
 def candidates_of(
-    learner: OfflineMPCLearner, run: Run, table: TransitionTable, bars: Bars, also: Mapping[str, MPC]
+    learner: OfflineMPCLearner,
+    run: Run,
+    table: TransitionTable,
+    bars: Bars,
+    also: Mapping[str, MPC],
+    kept: Kept | None = None,
+    learned_in: float = 0.0,
 ) -> Candidates | None:
     """What a learner could hand out at the end of a run, and what it does; None where that is the whole fit alone.
+
+    Args:
+        learner: The learner.
+        run: Its run, at the end.
+        table: The transitions as they were logged.
+        bars: Progress bars.
+        also: Further candidates.
+        kept: What an interrupted search has found, and where more of it is kept.
+        learned_in: How long the run took, in s of one core.
 
     Raises:
         UnknownIdError: If it was asked for a candidate that there is none of.
@@ -193,8 +213,11 @@ def candidates_of(
     if learner.candidate == "auto":
         show, variants = partial(bars.show, "choosing on models of the log"), partial(run.method.variants, known)
         if not between:
+            if learner.polish:
+                logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
             return None
         how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
+        how |= {"kept": kept, "learned_in": learned_in}
         how["ready"] = _as_it_is if soft is None else soft
         return tried(nominal, known, between, table, variants, show, **how)
     mpcs = {FIRST: nominal, **between, FULL: known.mpc}
@@ -218,6 +241,8 @@ def tried(
     polish: bool = False,
     keep_limits: float | None = None,
     ready: Callable[[MPC], MPC] = _as_it_is,
+    kept: Kept | None = None,
+    learned_in: float = 0.0,
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -231,7 +256,10 @@ def tried(
         polish: Whether the best one's weights are moved by what closed loops cost.
         keep_limits: In which share of its simulated steps the best one is to keep the given limits.
         ready: What becomes of each before it is tried.
+        kept: What an interrupted search over the weights has found, and where more of it is kept.
+        learned_in: How long the regressions took, in s of one core.
     """
+    begun = core_seconds()
     mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
@@ -239,19 +267,26 @@ def tried(
     around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
     around = various_first(around, mpcs[FIRST])
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
+    seconds, steps = {"the regressions": learned_in, "the choice": core_seconds() - begun}, [FIRST, FULL, chosen]
     if polish:
-        better, name = polished(mpcs[chosen], around, known.seed, tell), f"{chosen}, polished"
+        begun = core_seconds()
+        better, name = polished(mpcs[chosen], around, known.seed, tell, kept), f"{chosen}, polished"
         logger.log(logging.INFO if better.taken else logging.WARNING, "%s: %s", chosen, better.reason)
         if better.taken:
             mpcs, trials = {**mpcs, name: better.mpc}, trials.with_names([name])
             trials.fill({name: quick_policy(better.mpc)}, around, slice(0, len(trials.rows)))
             chosen = name if trials.improves(name) else chosen
+        seconds["polishing"] = core_seconds() - begun
+        steps.append(chosen)
+    effort = Effort.of(trials, seconds, steps)
     tighter = None if keep_limits is None else backed_off(mpcs[chosen], around, keep_limits, tell)
     if tighter is not None and tighter.mpc is not mpcs[chosen]:
         chosen += TIGHTER
         mpcs, trials = {**mpcs, chosen: tighter.mpc}, trials.with_names([chosen])
         trials.fill({chosen: quick_policy(tighter.mpc)}, around, slice(0, len(trials.rows)))
-    found = Candidates(mpcs, chosen, trials, tighter)
+    found = Candidates(mpcs, chosen, trials, tighter, effort)
+    if polish:
+        logger.info("%s", effort)
     if chosen == FIRST:
         logger.warning("%s\n%s", found.finding, found)
     else:

@@ -38,6 +38,7 @@ def write_learner(learner: OfflineMPCLearner, path: str | PathLike[str]) -> None
         "polish": learner.polish,
         "soften": learner.soften,
         "keep_limits": learner.keep_limits,
+        "start": None if learner.start is None else learner.start.to_json(),
         "candidates": None if learner.candidates is None else learner.candidates.to_json(),
         "observation_space": None if space is None else box_to_json(space),
     }
@@ -65,6 +66,8 @@ def read_learner(cls: type[OfflineMPCLearner], path: str | PathLike[str]) -> Off
         learner.soften = check_soften(document["soften"], FileFormatError)
         if document["keep_limits"] is not None:
             learner.keep_limits = float(document["keep_limits"])
+        if document.get("start") is not None:
+            learner.start = MPC.from_json(document["start"])
         if document["candidates"] is not None:
             learner.candidates = Candidates.from_files(document["candidates"], arrays)
         if document["result"] is not None:

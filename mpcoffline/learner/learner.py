@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -22,9 +23,11 @@ from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.shown import parameter_table
+from mpcoffline.simulation.polishing import check_search
 
 from .candidates import Candidates, candidates_of, check_also
 from .checkpoint import Checkpoint, History
+from .effort import core_seconds
 from .files import read_learner, write_learner
 from .findings import findings
 from .presets import PRESETS
@@ -78,7 +81,8 @@ class OfflineMPCLearner:
             the best, MPC_1 where none is better; that solves MPCs, learning does not. ``"full"``, or another name,
             takes that one and tries nothing. The paper's preset has no others than the whole fit.
         polish: Whether weights of the best candidate are moved, too, by what closed loops on models of the log cost
-            (``mpcoffline.simulation.polishing``); needs ``pip install "mpcoffline[polish]"``.
+            (``mpcoffline.simulation.polishing``); needs ``candidate="auto"`` and ``pip install "mpcoffline[polish]"``.
+            ``learner.candidates.effort`` says what that gained in its time, and the regressions in theirs.
         soften: ``"auto"`` puts exact penalties in place of the hard limits of all candidates and of what is handed out,
             at prices from MPC_1's multipliers in states of the log (:func:`mpcoffline.solvers.softened`): where a
             limit cannot be kept, it is violated as little as it must be. ``findings`` and report say which, and how
@@ -153,10 +157,12 @@ class OfflineMPCLearner:
         self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
         if keep_limits is not None:
             check_number("keep_limits", keep_limits, 0.0, 1.0)
-            if candidate != "auto":
-                raise InvalidArgumentError("candidate", expected="'auto' with keep_limits", actual=repr(candidate))
+        for name, asked in (("keep_limits", keep_limits is not None), ("polish", self.polish)):
+            if asked and candidate != "auto":
+                raise InvalidArgumentError("candidate", expected=f"'auto' with {name}", actual=repr(candidate))
         self.soften, self.keep_limits = check_soften(soften), keep_limits
         self.softening: Softening | None = None
+        self.start: MPC | None = None  # of the last fit
         self.candidates: Candidates | None = None
         self._given_value_function = self.value_function = value_function
         self.result: FitResult | None = None
@@ -206,6 +212,7 @@ class OfflineMPCLearner:
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
         also: Mapping[str, MPC] | None = None,
+        start: MPC | None = None,
     ) -> History:
         """Learns, stage by stage: by all presets V_phi, then theta.
 
@@ -225,6 +232,8 @@ class OfflineMPCLearner:
                 ends with the theta that it would have had without interruption, bit for bit.
             show_progress: Whether to draw a progress bar.
             also: Further MPCs of this plant by name, as one that runs already: candidates beside what is learned.
+            start: An MPC that was learned before, as from a part of the data: identification begins there, too, and
+                ends at the better minimum. What the data leave open stays near the given values.
 
         Returns:
             ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
@@ -233,8 +242,8 @@ class OfflineMPCLearner:
         Raises:
             InvalidDataError: If the data do not fit the MPC, or hold NaN or actions out of bounds, or
                 :func:`mpcoffline.check` is certain of a contradiction.
-            InvalidArgumentError: If the checkpoint is of another fit, the given V_phi of another discount, or
-                ``dataset`` something else.
+            InvalidArgumentError: If the checkpoint is of another fit, the given V_phi of another discount,
+                ``dataset`` something else, or what ``polish`` needs is not installed.
             UnknownIdError: For an unknown data set id.
         """
         for _ in self.fitter(
@@ -246,6 +255,7 @@ class OfflineMPCLearner:
             checkpoint=checkpoint,
             show_progress=show_progress,
             also=also,
+            start=start,
         ):
             pass
         return self.history
@@ -261,8 +271,12 @@ class OfflineMPCLearner:
         checkpoint: str | PathLike[str] | None = None,
         show_progress: bool = True,
         also: Mapping[str, MPC] | None = None,
+        start: MPC | None = None,
     ) -> Iterator[tuple[int, dict[str, float]]]:
         """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
+        begun = core_seconds()
+        if self.polish:
+            check_search()
         for name in evaluators or {}:
             check_name("evaluator", name)
         check_also(self.nominal_mpc, also or {})
@@ -275,6 +289,7 @@ class OfflineMPCLearner:
         for finding in report.warnings:
             logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
+        self.start, known = start, replace(known, start=start)
         self.softening = Softening.of(self.nominal_mpc, table, self.seed) if self.soften else None
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
@@ -300,7 +315,8 @@ class OfflineMPCLearner:
                 if any(_asks_to_end(answer) for answer in answers):
                     break
             if run.learned is not None:
-                self.candidates = candidates_of(self, run, table, bars, also or {})
+                kept = None if saved is None else saved.kept
+                self.candidates = candidates_of(self, run, table, bars, also or {}, kept, core_seconds() - begun)
                 self._policy = None
             self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
 

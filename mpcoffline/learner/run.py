@@ -140,6 +140,8 @@ class Run:
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
         for column in (start.table.rows, start.table.episode_ids, *start.table.centring):
             digest.update(np.ascontiguousarray(column).data)
+        if start.start is not None:
+            digest.update(json.dumps(start.start.to_json(), sort_keys=True).encode())
         if start.value_function is not None:
             for array in start.value_function.to_arrays().values():
                 digest.update(np.ascontiguousarray(array).data)

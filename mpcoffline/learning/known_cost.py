@@ -226,7 +226,13 @@ def as_applied(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> NDAr
 
 
 def identify_as_logged(
-    mpc: MPC, table: TransitionTable, rows: TransitionTable, *, tried: Sequence[str] = (), seed: int = 0
+    mpc: MPC,
+    table: TransitionTable,
+    rows: TransitionTable,
+    *,
+    tried: Sequence[str] = (),
+    seed: int = 0,
+    start: MPC | None = None,
 ) -> tuple[Identification, TransitionTable]:
     """The model identified from the rows that tell what inputs do, and all rows without measurement noise.
 
@@ -238,11 +244,12 @@ def identify_as_logged(
         rows: Those of :func:`as_logged`.
         tried: See :func:`mpcoffline.estimation.identify`.
         seed: Likewise.
+        start: Likewise.
 
     Returns:
         What was identified, whose own table are the rows without noise; and the whole table without it.
     """
-    found = identify(mpc, rows, tried=tried, seed=seed)
+    found = identify(mpc, rows, tried=tried, seed=seed, start=start)
     if rows is table:
         return found, found.table
     if found.noise.negligible:

@@ -133,6 +133,7 @@ class Known:
         result: What the fit found; the last stage leaves one.
         given: MPC_1, of which the method may have changed horizon and discount.
         found: What identification found; None where the model was not identified.
+        start: An MPC that was learned before, where searches begin, too; None without.
     """
 
     mpc: MPC
@@ -148,6 +149,7 @@ class Known:
     result: FitResult | None = None
     given: MPC | None = None
     found: Identification | None = None
+    start: MPC | None = None
 
     @property
     def constant_value(self) -> ValueFunction:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 
 from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.core.executors import Executor, Serial
+from mpcoffline.core.parallel import chosen, n_cpus
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import SOLVERS, CompilerError
 
-from .trials import Surroundings, Trials
+from .trials import Episodes, Surroundings, Trials
 
 FIRST = "MPC_1"
 _SLOW = 10.0  # times as fast as ipopt
@@ -35,9 +38,12 @@ def choose(
 
     In rounds, each with more starts: after each, those leave that cost clearly more than the best. Where the last one
     leaves several that are not alike, all usual starts choose and the spare ones judge. The best has the least mean
-    cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by
-    both regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the
-    next best is asked; where no model has a vote, ``"MPC_1"`` stays.
+    cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by both
+    regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the next
+    best is asked; where no model has a vote, ``"MPC_1"`` stays.
+
+    What acts in a round does so in groups of four: here, or as jobs of the executor that ``$MPCOFFLINE_EXECUTOR``
+    names, which gives the same numbers.
 
     Args:
         mpcs: By name, the first one ``"MPC_1"``; variants that were tried join them.
@@ -50,16 +56,28 @@ def choose(
         The trials, and the name of the best.
     """
     usual = around.usual
-    ends = sorted({max(1, round(usual * share)) for share in _ROUNDS})
     trials = Trials.none(list(mpcs), around)
     if not trials.votes.any():
         return trials.judged_from(0), FIRST
-    policies, left, begin = {name: quick_policy(mpc) for name, mpc in mpcs.items()}, list(mpcs), 0
+    with Stage(around, usual, tell) as stage:
+        return _chosen(trials, mpcs, around, variants, stage, preferred)
+
+
+def _chosen(
+    trials: Trials,
+    mpcs: dict[str, MPC],
+    around: Surroundings,
+    variants: Callable[[Mapping[str, MPC], int], Mapping[str, MPC]],
+    stage: Stage,
+    preferred: str,
+) -> tuple[Trials, str]:
+    """The rounds of :func:`choose`."""
+    usual, left, begin = around.usual, list(mpcs), 0
+    ends = sorted({max(1, round(usual * share)) for share in _ROUNDS})
+    stage.add(mpcs)
 
     def act(names: list[str], starts: slice) -> None:
-        for some in (names[i : i + _TOGETHER] for i in range(0, len(names), _TOGETHER)):
-            tell(starts.start, usual, ", ".join(some))
-            trials.fill({name: policies[name] for name in some}, around, starts)
+        stage.act(names, trials, starts)
 
     for turn, end in enumerate(ends):
         act(left, slice(begin, end))
@@ -67,12 +85,11 @@ def choose(
             good = _still_good(trials, left, end, preferred)[: _VARIED[turn]]
             more = variants({name: mpcs[name] for name in good}, turn)
             mpcs.update(more)
-            policies.update({name: quick_policy(mpc) for name, mpc in more.items()})
+            stage.add(more)
             trials, left = trials.with_names(list(more)), [*left, *more]
             act(list(more), slice(0, end))
         left, begin = [FIRST, *_still_good(trials, left, end, preferred)], end
         if left == [FIRST]:
-            tell(usual, usual, "")
             return trials.judged_from(begin), FIRST
     total = usual
     if len(left) > 2 and len(around.rows) > usual:
@@ -85,7 +102,6 @@ def choose(
         if trials.judged_from(begin).improves(name):
             chosen = name
             break
-    tell(usual, usual, "")
     return trials.judged_from(begin), chosen
 
 
@@ -109,6 +125,76 @@ def various_first(around: Surroundings, mpc: MPC) -> Surroundings:
     reversed_digits = [int(f"{i:0{digits}b}"[::-1], 2) for i in range(len(cost))]
     order = dearest[np.argsort(reversed_digits)]
     return around.reordered(np.append(order, np.arange(around.usual, len(around.rows))))
+
+
+class Stage:
+    """Where MPCs act, a group at a time: here, or in the workers of an executor.
+
+    Args:
+        around: What happens to them.
+        usual: How many starts there are, as is told.
+        tell: Is told how many starts of how many are done, and what is tried; at the end, that all are.
+    """
+
+    def __init__(self, around: Surroundings, usual: int, tell: Callable[[int, int, str], None]) -> None:
+        self._around, self._usual, self._tell = around, usual, tell
+        self._mpcs: dict[str, MPC] = {}
+        self._acting = _Acting(around)
+        self._pool: Executor[_Act, list[Episodes]] | None = None
+        kind = chosen(default="serial")
+        if kind is not Serial:
+            self._pool = kind(self._acting, n_cpus())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.close()
+        if kind is None:
+            self._tell(self._usual, self._usual, "")
+
+    def add(self, mpcs: Mapping[str, MPC]) -> None:
+        """Further ones, by name."""
+        self._mpcs.update(mpcs)
+
+    def act(self, names: list[str], trials: Trials, starts: slice) -> None:
+        """Puts what some do from some of the starts into the trials.
+
+        Raises:
+            JobError: If a worker fails, or is lost again and again.
+        """
+        groups = [names[i : i + _TOGETHER] for i in range(0, len(names), _TOGETHER)]
+        jobs = {", ".join(some): _Act({name: self._mpcs[name] for name in some}, starts) for some in groups}
+        if self._pool is None:
+            for told, job in jobs.items():
+                self._tell(starts.start, self._usual, told)
+                trials.put(dict(zip(job.mpcs, self._acting(job), strict=True)), self._around, starts)
+            return
+        self._tell(starts.start, self._usual, "; ".join(jobs))
+        for told, done in self._pool.run(jobs):
+            trials.put(dict(zip(jobs[told].mpcs, done, strict=True)), self._around, starts)
+
+
+class _Act(NamedTuple):
+    """A job: MPCs that act together from some of the starts."""
+
+    mpcs: dict[str, MPC]
+    starts: slice
+
+
+class _Acting:
+    """Does jobs; whoever does several keeps the solvers."""
+
+    def __init__(self, around: Surroundings) -> None:
+        self._around = around
+        self._policies: dict[str, MPCPolicy] = {}
+
+    def __call__(self, job: _Act) -> list[Episodes]:
+        for name, mpc in job.mpcs.items():
+            if name not in self._policies:
+                self._policies[name] = quick_policy(mpc)
+        return self._around.act([self._policies[name] for name in job.mpcs], job.starts)
 
 
 def are_slow(policies: Iterable[MPCPolicy]) -> bool:

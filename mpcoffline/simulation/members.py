@@ -12,7 +12,8 @@ from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Residual
-from mpcoffline.estimation.identification import OneStepProblem, Rows
+from mpcoffline.estimation.identification import OneStepProblem
+from mpcoffline.estimation.rows import Rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.integrators import Scheme
 from mpcoffline.mpc.substeps import Flow, choice_on

@@ -12,9 +12,10 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residuals
-from mpcoffline.estimation.identification import FULL_TURN, OneStepIdentification, OneStepProblem, Rows, without_jumps
+from mpcoffline.estimation.identification import OneStepIdentification, OneStepProblem
 from mpcoffline.estimation.multi_step import Windows
 from mpcoffline.estimation.plant import plant_rows, state_rows
+from mpcoffline.estimation.rows import FULL_TURN, Rows, without_jumps
 from mpcoffline.estimation.structure import HeldOut
 from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.mpc import MPC

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import importlib.util
+import json
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +24,9 @@ _STARTS = 24  # of the surroundings that tune; the others judge
 _SPREAD = 0.5  # of the first logarithms: factors of 1.6
 _MOST = 0.2  # of how much costs differ from start to start: who promises more has found an error of the models
 _SURE = 2.0  # standard errors
+
+#: Gains of the weights tried so far, by the name of a search; what is put in may be written to a file.
+Kept = MutableMapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,11 @@ class Polished:
 
 
 def polished(
-    mpc: MPC, around: Surroundings, seed: int = 0, tell: Callable[[int, int, str], None] = lambda *what: None
+    mpc: MPC,
+    around: Surroundings,
+    seed: int = 0,
+    tell: Callable[[int, int, str], None] = lambda *what: None,
+    kept: Kept | None = None,
 ) -> Polished:
     """Moves stage and terminal weights so that closed loops on models of the log cost less.
 
@@ -63,10 +73,12 @@ def polished(
         around: The models, their starts and all else that happens.
         seed: Of the search.
         tell: Is told how many of how many weights are tried, and what is done.
+        kept: What an interrupted search has found: it goes on from there, and ends as if nothing had happened.
 
     Raises:
         InvalidArgumentError: If the package ``cma`` is not installed.
     """
+    check_search()
     groups = scaled_together(mpc)
     votes = np.flatnonzero(around.models.votes)
     if not groups or not len(votes):
@@ -75,12 +87,17 @@ def polished(
     some = slice(0, min(_STARTS, len(around.rows) // 2))
     base = tuning.act([quick_policy(mpc)], some)[0].cost.mean(axis=1)
     search = _search(max(2, len(groups)), seed)
+    kept, name = {} if kept is None else kept, _name(mpc, around, seed)
+    known = [gains for gains in kept.get(name, np.empty((0, _TOGETHER))) if gains.shape == (_TOGETHER,)]
     best, best_gain, count = mpc, 0.0, 0
     while count < _EVALUATIONS and not search.stop():
         drawn = search.ask()
-        mpcs = [_moved(mpc, groups, z) for z in drawn]
-        done = tuning.act([quick_policy(each) for each in mpcs], some)
-        gains = np.array([_gain(base - each.cost.mean(axis=1)) for each in done])
+        mpcs, batch = [_moved(mpc, groups, z) for z in drawn], count // _TOGETHER
+        if batch == len(known):
+            done = tuning.act([quick_policy(each) for each in mpcs], some)
+            known.append(np.array([_gain(base - each.cost.mean(axis=1)) for each in done]))
+            kept[name] = np.stack(known)
+        gains = known[batch]
         search.tell(drawn, (-gains).tolist())
         k, count = int(np.argmax(gains)), count + len(drawn)
         if gains[k] > best_gain:
@@ -116,14 +133,28 @@ def _moved(mpc: MPC, groups: list[NDArray[np.intp]], z: Array) -> MPC:
     return mpc.with_theta(np.clip(theta, mpc.space.low, mpc.space.high))
 
 
-def _search(size: int, seed: int) -> Any:
-    try:
-        import cma
-    except ImportError as error:
+def check_search() -> None:
+    """Refuses a search that cannot be made here.
+
+    Raises:
+        InvalidArgumentError: If the package ``cma`` is not installed.
+    """
+    if importlib.util.find_spec("cma") is None:
         hint = 'pip install "mpcoffline[polish]"'
-        raise InvalidArgumentError("polish", expected="the package cma", actual="none installed", hint=hint) from error
+        raise InvalidArgumentError("polish", expected="the package cma", actual="none installed", hint=hint)
+
+
+def _search(size: int, seed: int) -> Any:
+    import cma
+
     options = {"seed": seed + 1, "popsize": _TOGETHER, "verbose": -9, "maxfevals": _EVALUATIONS}
     return cma.CMAEvolutionStrategy(size * [0.0], _SPREAD, options)
+
+
+def _name(mpc: MPC, around: Surroundings, seed: int) -> str:
+    """What decides a search, as a short text."""
+    described = mpc.to_json(), around.models.names, around.rows.tolist(), around.n_steps, seed
+    return f"polish-{hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:16]}"
 
 
 def _gain(gains: Array) -> float:

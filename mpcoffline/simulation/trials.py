@@ -90,11 +90,15 @@ class Trials:
     ) -> dict[str, Episodes]:
         """Adds what controllers do from some of the starts; ``kept`` as :meth:`Surroundings.act` has it."""
         done = dict(zip(controllers, around.act(list(controllers.values()), starts, kept), strict=True))
+        self.put(done, around, starts)
+        return done
+
+    def put(self, done: Mapping[str, Episodes], around: Surroundings, starts: slice) -> None:
+        """Adds what controllers have done from some of the starts, by name."""
         for name, episodes in done.items():
             k, before = self.names.index(name), around.before[starts]
             self.cost[k, :, starts], self.second[k, :, starts] = episodes.cost + before, episodes.second + before
             self.lost[k, :, starts] = episodes.lost
-        return done
 
     def with_names(self, more: Sequence[str]) -> Trials:
         """With further controllers, not tried yet."""

@@ -20,7 +20,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 _MUST_HAVE = ("DT", "STEPS", "DISCOUNT", "N_EPISODES", "Plant", "behaviour", "mpc", "truth")
-_LOG, _BEHAVIOUR, _STARTS = 7, 5, 900
+_LOG, _BEHAVIOUR, _TRIAL, _STARTS = 7, 5, 11, 900
 
 
 class MissingPackageError(MPCOfflineError):
@@ -78,11 +78,31 @@ class PlantFile:
 
     def log(self, seed: int) -> TransitionTable:
         """The log that the plant's own controllers make, another controller each episode."""
+        rngs = [np.random.default_rng([_LOG, seed, episode]) for episode in range(self.module.N_EPISODES)]
+        return self._recorded(rngs, self.module.behaviour)
+
+    def trial(self, policy: MPCPolicy, seed: int, n_episodes: int) -> TransitionTable:
+        """The log of a trial of a policy, from starts that neither the log nor the closed loops hold."""
+
+        def controller(_: np.random.Generator) -> Callable[[Array, int], Array]:
+            states: list[Any] = [None]
+
+            def act(observation: Array, k: int) -> Array:
+                action, states[0] = policy.predict(observation, state=states[0])
+                return np.asarray(action)
+
+            return act
+
+        return self._recorded([np.random.default_rng([_TRIAL, seed, e]) for e in range(n_episodes)], controller)
+
+    def _recorded(
+        self, rngs: Sequence[np.random.Generator], controller: Callable[[np.random.Generator], Any]
+    ) -> TransitionTable:
+        """Episodes, each with draws and a controller of its own."""
         rows: dict[str, list[Any]] = {name: [] for name in ("s", "a", "cost", "s_next", "end", "episode")}
-        for episode in range(self.module.N_EPISODES):
-            rng = np.random.default_rng([_LOG, seed, episode])
+        for episode, rng in enumerate(rngs):
             plant, observation = self._started(rng)
-            act = self.module.behaviour(rng)
+            act = controller(rng)
             for k in range(self.module.STEPS):
                 action = np.atleast_1d(np.asarray(act(observation, k), np.float64))
                 reached, cost, ended = plant.step(action)

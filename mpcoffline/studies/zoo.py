@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.errors import FileFormatError, StorageError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learner.candidates import FULL
+from mpcoffline.learner.effort import core_seconds
 from mpcoffline.learner.learner import OfflineMPCLearner
 
 from .plant_files import Loops, PlantFile
@@ -31,6 +28,8 @@ if TYPE_CHECKING:
 NAN = float("nan")
 MARGIN, CLOSE = 0.02, 0.05  # "worse" and "better" by more than this of |MPC_1|; "as good" within this of |yardstick|
 _SAID = 300
+
+Found = dict[str, Any]  # figures of a case by the names of its columns
 
 
 @dataclass(frozen=True)
@@ -148,6 +147,13 @@ class Outcome:
         """That of its case."""
         return self.plant, self.seed, self.starts
 
+    def __str__(self) -> str:
+        """In short."""
+        return self.error or (
+            f"MPC_1 {self.mpc_1:.5g}, yardstick {self.yardstick:.5g}, learned {self.learned:.5g}"
+            f" ({self.gain:+.3g} +- {self.gain_error:.2g}), fit {self.fit_s:.0f} s"
+        )
+
     @property
     def worse(self) -> bool:
         """Whether the learned MPC costs more than MPC_1, by more than 2 % of its size; so does one without a cost."""
@@ -201,15 +207,20 @@ def run_case(case: Case, tell: Callable[[str], None] = lambda what: None) -> Out
         case: The case.
         tell: Is told what is being done.
     """
-    found: dict[str, float | int | str] = {}
+    found: Found = {}
+    noted(found, lambda: _fill(found, case, tell))
+    return Outcome(case.plant, case.seed, case.n_starts, **found)
+
+
+def noted(found: Found, fill: Callable[[], None]) -> None:
+    """Fills in the figures of a case; an error becomes one of them, so that no case ends the others."""
     try:
-        _fill(found, case, tell)
-    except Exception as error:  # one case must not end the others
-        found["error"] = _short(f"{type(error).__name__}: {error}")
-    return Outcome(case.plant, case.seed, case.n_starts, **found)  # type: ignore[arg-type]
+        fill()
+    except Exception as error:
+        found["error"] = short_text(f"{type(error).__name__}: {error}")
 
 
-def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str], None]) -> None:
+def _fill(found: Found, case: Case, tell: Callable[[str], None]) -> None:
     """The figures of a case, each put down as soon as it is known."""
     tell("log")
     plant = PlantFile.load(Path(case.path))
@@ -235,15 +246,15 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
     said: list[str] = []
     learned_by: list[float] = []  # until here nothing was chosen
     learner = OfflineMPCLearner(nominal, learn=getattr(plant.module, "LEARN", "cost+model"), seed=seed)
-    start = _core_seconds()
-    with _heard(said):
-        learner.fit(table, show_progress=False, callbacks=[lambda *_: learned_by.append(_core_seconds())])
-    found["fit_s"], found["choice_s"] = _core_seconds() - start, _core_seconds() - max(learned_by, default=start)
-    found["said"] = _short("; ".join(dict.fromkeys(said)))
+    start = core_seconds()
+    with heard(said):
+        learner.fit(table, show_progress=False, callbacks=[lambda *_: learned_by.append(core_seconds())])
+    found["fit_s"], found["choice_s"] = core_seconds() - start, core_seconds() - max(learned_by, default=start)
+    found["said"] = short_text("; ".join(dict.fromkeys(said)))
     tell("build of the solver")
-    start = _core_seconds()
+    start = core_seconds()
     _ = learner.policy.solver
-    found["build_s"] = _core_seconds() - start
+    found["build_s"] = core_seconds() - start
     learned = loops("learned", learner.policy)
     found["gain"], found["gain_error"] = paired(learned.cost, first.cost)
     found["more_over"], found["more_over_error"] = paired(learned.violated, first.violated)
@@ -266,7 +277,7 @@ def _fill(found: dict[str, float | int | str], case: Case, tell: Callable[[str],
 
 
 def _judge(
-    found: dict[str, float | int | str],
+    found: Found,
     learner: OfflineMPCLearner,
     whole: OfflineMPCLearner,
     table: TransitionTable,
@@ -276,10 +287,10 @@ def _judge(
     """What ``diagnose`` says of what was handed out, and of the whole fit."""
     from mpcoffline.diagnostics import diagnose
 
-    start = _core_seconds()
+    start = core_seconds()
     report = diagnose(learner, table, seed=seed)
-    found["verdict_s"] = _core_seconds() - start
-    found["verdict"], found["reason"] = report.verdict, _short(report.reasons[0] if report.reasons else "")
+    found["verdict_s"] = core_seconds() - start
+    found["verdict"], found["reason"] = report.verdict, short_text(report.reasons[0] if report.reasons else "")
     if report.trials.n_steps == n_steps:
         found["lowest"], found["expected"], found["highest"] = report.judgement.expected
     found["warned"] = _warned(report)
@@ -302,11 +313,6 @@ def taking(learner: OfflineMPCLearner, name: str) -> OfflineMPCLearner:
     return other
 
 
-def _core_seconds() -> float:
-    """What this process and its compilers have computed so far, in s: on a busy machine, too, what one core needs."""
-    return sum(os.times()[:4])
-
-
 def paired(costs: Array, others: Array) -> tuple[float, float]:
     """Mean of the differences of costs ``(n,)`` from the same starts, and its standard error (NaN for one start)."""
     difference = costs - others
@@ -315,15 +321,18 @@ def paired(costs: Array, others: Array) -> tuple[float, float]:
 
 
 @contextmanager
-def _heard(said: list[str]) -> Iterator[None]:
-    """Collects warnings and logged warnings of the package."""
+def heard(said: list[str], level: str = "WARNING") -> Iterator[None]:
+    """Collects warnings, and what the package logs from a level on."""
 
     class Ear(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             said.append(record.getMessage())
 
-    ear, logger = Ear(logging.WARNING), logging.getLogger("mpcoffline")
+    ear, logger = Ear(level), logging.getLogger("mpcoffline")
     logger.addHandler(ear)
+    before = logger.level
+    if logger.getEffectiveLevel() > ear.level:
+        logger.setLevel(ear.level)
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -331,64 +340,10 @@ def _heard(said: list[str]) -> Iterator[None]:
         said += [str(each.message) for each in caught if not issubclass(each.category, DeprecationWarning)]
     finally:
         logger.removeHandler(ear)
+        logger.setLevel(before)
 
 
-def _short(text: str) -> str:
+def short_text(text: str) -> str:
+    """Text on one line, cut."""
     line = " ".join(text.split())
     return line if len(line) <= _SAID else line[: _SAID - 3] + "..."
-
-
-_COLUMNS = [field.name for field in fields(Outcome)]
-
-
-def append(path: Path, outcome: Outcome) -> None:
-    """Adds a line to a CSV file, which it begins where there is none; on the disk when it returns.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
-    values = {key: f"{value:.10g}" if isinstance(value, float) else value for key, value in asdict(outcome).items()}
-    try:
-        with path.open("a+b") as file:
-            text = io.StringIO()
-            writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
-            if (size := file.seek(0, os.SEEK_END)) == 0:
-                writer.writeheader()
-            else:
-                file.seek(size - 1)
-                if file.read(1) != b"\n":  # what a killed process has left
-                    text.write("\n")
-            writer.writerow(values)
-            file.write(text.getvalue().encode())  # at the end, whatever was read
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise StorageError.of(path, error) from error
-
-
-def read(path: Path) -> list[Outcome]:
-    """The outcomes in a CSV file, the last of each case; lines that are not whole are passed over.
-
-    Raises:
-        FileFormatError: For a file with other columns.
-    """
-    if not path.exists():
-        return []
-    with path.open(encoding="utf-8", newline="") as file:
-        lines = list(csv.reader(file))
-    if lines and lines[0] != _COLUMNS:
-        expected = "results of this version"
-        raise FileFormatError(str(path), expected=expected, actual="other columns", hint="Write to another file.")
-    found: dict[tuple[str, int, int], Outcome] = {}
-    kinds = {field.name: field.type for field in fields(Outcome)}
-    convert: dict[str, Callable[[str], float | int | str]] = {"int": int, "float": float, "str": str}
-    for line in lines[1:]:
-        if len(line) != len(_COLUMNS):
-            continue
-        try:
-            values = {name: convert[str(kinds[name])](value) for name, value in zip(_COLUMNS, line, strict=True)}
-        except ValueError:
-            continue
-        outcome = Outcome(**values)  # type: ignore[arg-type]
-        found[outcome.key] = outcome
-    return list(found.values())

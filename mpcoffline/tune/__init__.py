@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from mpcoffline.diagnostics.trial import Calibration
+
 from .log_check import check_log
 from .page import LogCheck, Remark
 from .retuning import Retuned, retune
-from .trial import Calibration
 from .tuned import Tuned
 from .tuning import tune
 

@@ -8,15 +8,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mpcoffline.control.export import export_c
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.outputs import write_file
+from mpcoffline.core.text import figure
 from mpcoffline.datasets.table.files import hash_of, save_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics import diagnose
 from mpcoffline.diagnostics.page import Section
 from mpcoffline.diagnostics.report import Report
+from mpcoffline.diagnostics.trial import stretched
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST
@@ -45,6 +49,9 @@ class Order:
         sections: Further parts of the page.
         today: How many episodes, the first ones, were made by the controller that runs today; all by default.
         doubt: Why nothing may be recommended whatever the models say; empty where nothing speaks against it.
+        start: What was learned before, where identification begins, too.
+        widened: How many times as wide as models alone say the band of the proposal's cost is, since trials lay outside
+            theirs.
     """
 
     plant: str
@@ -56,6 +63,8 @@ class Order:
     sections: Sequence[Section] = ()
     today: int | None = None
     doubt: str = ""
+    start: MPC | None = None
+    widened: float = 1.0
 
 
 def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> dict[str, Any]:
@@ -86,6 +95,7 @@ def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> 
         if order.doubt and report.verdict != KEEP:
             judgement, reasons = report.judgement, (order.doubt, *report.reasons)
             report = replace(report, judgement=replace(judgement, verdict="try with care", reasons=reasons))
+        report = _calibrated(report, order.widened)
         report.html(path / PAGE, title=order.plant, sections=order.sections)
         return _judgement(report, learner)
 
@@ -115,6 +125,19 @@ def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> 
     }
 
 
+def _calibrated(report: Report, widened: float) -> Report:
+    """The report with the band that trials before have shown to be right."""
+    judgement = report.judgement
+    low, middle, high = expected = stretched(judgement.expected, widened)
+    if widened == 1.0 or not np.isfinite(expected).all():
+        return report
+    said = (
+        f"Trials so far lay as far from what was predicted that the band of the proposal is {widened:.2g} times as wide"
+        f" as models alone say: expect {figure(middle, 4)} an episode, {figure(low, 4)} to {figure(high, 4)}."
+    )
+    return replace(report, judgement=replace(judgement, expected=expected, reasons=(*judgement.reasons, said)))
+
+
 def _learner(order: Order, path: Path, tell: Tell, show_progress: bool) -> OfflineMPCLearner:
     """The fitted learner: the one that is there, or a new one."""
     file = path / LEARNER
@@ -123,7 +146,7 @@ def _learner(order: Order, path: Path, tell: Tell, show_progress: bool) -> Offli
     checkpoint = path / CHECKPOINT
     tell("Fitting" + (", from where it was interrupted" if checkpoint.is_file() else ""))
     learner = OfflineMPCLearner(order.mpc, **order.options)
-    learner.fit(order.table, checkpoint=checkpoint, show_progress=show_progress, also=order.also)
+    learner.fit(order.table, checkpoint=checkpoint, show_progress=show_progress, also=order.also, start=order.start)
     learner.save(file)
     return learner
 

@@ -16,11 +16,11 @@ from mpcoffline.datasets.logs.wanted import Wanted
 from mpcoffline.datasets.table.files import hash_of
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
+from mpcoffline.diagnostics.trial import Band, Calibration, compared, widening
 from mpcoffline.simulation.choice import FIRST
 
 from .folder import PLANT, RUN, Workplace, identity_of, read_run
 from .making import RUNNING, Order, Tell, made
-from .trial import Band, Calibration, compared
 from .tuned import Tuned, item
 
 _DOUBT = (
@@ -57,7 +57,8 @@ def retune(
     """Compares a trial with what was predicted for it, and learns from both logs.
 
     The plant file is not run again: what reads logs and what a step costs stands in the folder. The controller of the
-    trial is a candidate beside what is learned now, so that it is handed out again where nothing is better. The folder
+    trial is a candidate beside what is learned now, so that it is handed out again where nothing is better; and
+    identification begins at the model that was learned before, too. The folder
     is replaced as a whole; what it held is kept in a numbered folder inside. A trial that it has learned from already
     changes nothing.
 
@@ -91,12 +92,12 @@ def retune(
     if place.begin():
         tell(f"Going on with {place.path}")
     learner, log, running = before.learner, before.table, before.policy.mpc
-    today = log.n_episodes if today is None else today
+    today, before_widened = log.n_episodes if today is None else today, _widened(history)
 
     def tried() -> dict[str, Any]:
         tell("Comparing the trial with what was predicted")
-        found = compared(learner, running, log, table, expected=expected, today=today, seed=options["seed"])
-        return found.to_json()
+        how = {"expected": expected, "today": today, "seed": options["seed"], "widened": before_widened}
+        return compared(learner, running, log, table, **how).to_json()
 
     calibration = Calibration.from_json(place.once("trial", tried))
     history.append({"sha256": sha, "rows": len(table), "controller": before.document["policy"]} | calibration.to_json())
@@ -104,7 +105,8 @@ def retune(
     also = {} if before.document["policy"] == FIRST else {RUNNING: running}
     sections = [_section(calibration, history), _read_section(table)]
     reader_json, doubt = _reader_json(before), _DOUBT if calibration.far else ""
-    order = Order(name, reader_json, learner.nominal_mpc, both, options, also, sections, today, doubt)
+    how = also, sections, today, doubt, learner.mpc, _widened(history)
+    order = Order(name, reader_json, learner.nominal_mpc, both, options, *how)
     document = made(order, place, tell, show_progress=show_progress)
     kept = {key: before.document[key] for key in ("check", "read") if key in before.document}
     document |= kept | {"trials": history, "today": today}
@@ -148,7 +150,7 @@ def _of_before(before: Tuned) -> tuple[dict[str, Any], tuple[Band, int], int | N
     with file_errors(before.folder / RUN):
         document = before.document
         options, today, history = dict(document["options"]), document.get("today"), list(document.get("trials", []))
-        _ = options["seed"], [each["sha256"] for each in history], [each["off"] for each in history]
+        _ = options["seed"], [each["sha256"] for each in history], _widened(history)
         cost = document["costs"].get(document["policy"], {})
         low, middle, high = (
             float("nan") if cost.get(end) is None else float(cost[end]) for end in ("lowest", "expected", "highest")
@@ -171,13 +173,21 @@ def _read_section(table: LoggedTable) -> Section:
     return Section("What was read of the trial", (head,), table.report.notes, tables)
 
 
+def _widened(history: list[dict[str, Any]]) -> float:
+    """How many times as wide as the models alone say the next bands are."""
+    return widening((each["off"], float(each.get("widened", 1.0))) for each in history)
+
+
 def _record(history: list[dict[str, Any]]) -> list[str]:
-    """How the predictions have done so far."""
-    told = [each for each in history if each["off"] is not None]
-    if len(told) < 2:
-        return []
-    inside = sum(bool(each["inside"]) for each in told)
-    return [f"Of {len(told)} trials so far, {inside} cost what was predicted for them, within the band."]
+    """How the predictions have done so far, and what follows for the next ones."""
+    told, widened = [each for each in history if each["off"] is not None], _widened(history)
+    sentences = []
+    if len(told) > 1:
+        inside = sum(bool(each["inside"]) for each in told)
+        sentences = [f"Of {len(told)} trials so far, {inside} cost what was predicted for them, within the band."]
+    if widened > 1.0:
+        sentences += [f"The bands below, and of the next trial, are {widened:.2g} times as wide as models alone say."]
+    return sentences
 
 
 def trial_lines(document: Mapping[str, Any]) -> list[str]:

@@ -63,7 +63,7 @@ def test_a_job_whose_process_dies_is_done_again(tmp_path: Path) -> None:
 
 
 def test_other_executors_are_unknown() -> None:
-    with pytest.raises(UnknownIdError, match="executor: expected one of processes, serial"):
+    with pytest.raises(UnknownIdError, match="executor: expected one of joblib, processes, ray, serial"):
         parallel.map(abs, [1, 2], workers=2, executor="cluster")
 
 

@@ -231,3 +231,24 @@ def test_data_of_another_plant_are_refused() -> None:
     x, u = inputs(10, 2, 1)
     with pytest.raises(InvalidDataError, match="observations"):
         identify_one_step(mpcoffline.nominal_mpc("mpcoffline/PendulumSwingUp-v0"), table_of(x, u, x))
+
+
+def wavy(w: float) -> MPC:
+    """A model whose error has many minima in its frequency."""
+    step = {"w": Parameter(w, low=0.1, high=20.0)}
+    return mpc_of(Model(lambda x, u, p: 0.5 * x + u + ca.sin(p["w"] * x), 1, 1, 0.1, step, discrete=True))
+
+
+def test_an_earlier_model_is_where_the_search_begins_too() -> None:
+    """By hand: from w = 1.2 a descent ends in a minimum far from the true w = 7, from an earlier 6.8 it ends there."""
+    x, u = inputs(300, 1, 1)
+    table = table_of(2.0 * x, u, x + u + np.sin(7.0 * 2.0 * x))
+    cold = mpcoffline.estimation.identify(wavy(1.2), table)
+    assert abs(cold.theta[0] - 7.0) > 1.0
+    warm = mpcoffline.estimation.identify(wavy(1.2), table, start=wavy(6.8))
+    assert warm.theta[0] == pytest.approx(7.0, abs=1e-3)
+    assert warm.error_after < 0.1 * cold.error_after
+    # Of both ends the better one counts; an MPC without such a parameter, or of another shape, tells nothing.
+    assert mpcoffline.estimation.identify(wavy(6.8), table, start=wavy(1.2)).theta[0] == pytest.approx(7.0, abs=1e-3)
+    other = linear_mpc(np.eye(2), np.ones((2, 1)))
+    np.testing.assert_array_equal(mpcoffline.estimation.identify(wavy(1.2), table, start=other).theta, cold.theta)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,15 @@ import pytest
 from lq_episodes import episodes
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner
+from mpcoffline.core.archive import read_archive
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.learner.candidates import FULL
+from mpcoffline.learner.effort import Effort
 from mpcoffline.mpc import MPC
+from mpcoffline.simulation import polishing
 from mpcoffline.simulation.choice import FIRST
 from mpcoffline.simulation.polishing import Polished
+from mpcoffline.simulation.trials import Trials
 
 QUICK: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "quadratic", "seed": 0}
 LOG = episodes(n=40, steps=30)
@@ -138,6 +143,63 @@ def test_the_best_one_may_be_polished(
     assert again.candidates is not None
     assert again.candidates.chosen == plain.candidates.chosen  # type: ignore[union-attr]
     assert "not polished: why" in caplog.text
+
+
+def test_polishing_needs_a_choice_and_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package is asked for before anything is learned."""
+    with pytest.raises(InvalidArgumentError, match="'auto' with polish"):
+        OfflineMPCLearner(WRONG, candidate=FULL, polish=True)
+    monkeypatch.setitem(sys.modules, "cma", None)
+    learner = OfflineMPCLearner(WRONG, **QUICK, polish=True)
+    with pytest.raises(InvalidArgumentError, match=r"mpcoffline\[polish\]"):
+        learner.fit(LOG, show_progress=False)
+    assert not learner.history
+
+
+def test_a_fit_interrupted_while_it_is_polished_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = fitted(polish=True)
+    moved, real = [0], polishing._moved
+
+    def until(most: int) -> Any:
+        def move(*what: Any) -> MPC:
+            moved[0] += 1
+            if moved[0] > most:
+                raise KeyboardInterrupt
+            return real(*what)
+
+        return move
+
+    monkeypatch.setattr(polishing, "_moved", until(20))
+    path, again = tmp_path / "fit.ckpt", OfflineMPCLearner(WRONG, **QUICK, polish=True)
+    with pytest.raises(KeyboardInterrupt):
+        again.fit(LOG, show_progress=False, checkpoint=path)
+    _, arrays = read_archive(path, "checkpoint")
+    assert [array.shape for name, array in arrays.items() if name.startswith("kept/polish-")] == [(2, 8)]
+    monkeypatch.setattr(polishing, "_moved", until(10_000))
+    again = OfflineMPCLearner(WRONG, **QUICK, polish=True)
+    again.fit(LOG, show_progress=False, checkpoint=path)
+    assert again.candidates is not None
+    assert whole.candidates is not None
+    assert again.candidates.chosen == whole.candidates.chosen
+    np.testing.assert_array_equal(again.theta, whole.theta)
+    assert again.history == whole.history
+
+
+def test_regressions_and_simulation_are_told_side_by_side(plain: OfflineMPCLearner) -> None:
+    trials = Trials(
+        ("MPC_1", "full", "better", "best"), ("a", "b", "c"), np.array([True, True, False]),
+        np.array([[[9.0, 8.0]] * 3, [[5.0, np.nan]] * 3, [[3.0, 2.0]] * 3, [[2.0, 2.0], [2.0, 2.0], [-99.0, 0.0]]]),
+        np.zeros((4, 3, 2)), np.zeros((4, 3, 2), dtype=bool), np.arange(2), np.zeros(2), np.ones(2, dtype=bool),
+        np.ones(2, dtype=bool), 10,
+    )  # fmt: skip
+    effort = Effort.of(trials, {"learn": 2.0, "choose": 4.0, "polish": 10.0}, ("MPC_1", "full", "better", "best"))
+    assert effort.shares == (("learn", 2.0, 4.0), ("choose", 4.0, 2.0), ("polish", 10.0, 0.5))
+    assert [row[3] for row in effort.table.rows] == ["2", "0.5", "0.05"]
+    assert plain.candidates is not None
+    assert plain.candidates.effort is not None
+    learning, choice = plain.candidates.effort.shares
+    assert min(learning.seconds, choice.seconds) > 0.0
+    assert learning.gain > 0.0  # of a model that was far off
 
 
 def test_a_fit_that_a_callback_ends_chooses_too() -> None:

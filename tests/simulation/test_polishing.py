@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import lq_plant
 import numpy as np
@@ -22,11 +23,11 @@ LOG = episodes()
 BEST = lq_plant.make_mpc((lq_plant.A, lq_plant.B)).replace(discount=1.0, horizon=30)  # of a sum over 30 steps
 
 
-def on_the_log(mpc: MPC, seed: int = 0) -> tuple[Polished, Surroundings]:
+def on_the_log(mpc: MPC, seed: int = 0, **more: Any) -> tuple[Polished, Surroundings]:
     models = LogModels.of(BEST, LOG, identify_one_step(BEST, LOG), n_perturbed=1, n_residual=0)
     rows = LOG.episodes.firsts[:14]
     around = Surroundings(models, LoggedCost(LOG), LOG, rows, 30, BEST.layout)
-    return polished(mpc, around, seed), around
+    return polished(mpc, around, seed, **more), around
 
 
 def cost(mpc: MPC, around: Surroundings) -> float:
@@ -44,6 +45,47 @@ def test_wrong_weights_are_mended_as_far_as_the_models_tell() -> None:
     np.testing.assert_array_equal(found.mpc.model.space.theta, wrong.model.space.theta)
     again, _ = on_the_log(wrong)
     np.testing.assert_array_equal(again.mpc.theta, found.mpc.theta)
+
+
+def gain(mpc: MPC) -> lq_plant.Array:
+    """K of u = K x, ``(1, 2)``."""
+    return np.asarray(MPCPolicy(mpc).solver.solve(1e-2 * np.eye(2)).u0).T / 1e-2
+
+
+def test_the_gain_comes_near_that_of_riccati() -> None:
+    """The weights are not unique, the gain is: u = -(R + B'PB)^-1 B'PA x, with P by iteration from the end's."""
+    A, B, W, R, P = lq_plant.A, lq_plant.B, lq_plant.W, lq_plant.R, np.asarray(lq_plant.BEST.P)
+    for _ in range(30):
+        K = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        P = W + A.T @ P @ (A + B @ K)
+    np.testing.assert_allclose(gain(BEST), K, rtol=1e-6)
+    wrong = BEST.replace(stage_cost=QuadraticCost(lq_plant.W, 8.0 * np.asarray(lq_plant.R)))
+    found, _ = on_the_log(wrong)
+    assert np.linalg.norm(gain(found.mpc) - K) < 0.3 * np.linalg.norm(gain(wrong) - K)
+
+
+def test_an_interrupted_search_goes_on_and_ends_as_without() -> None:
+    wrong = BEST.replace(stage_cost=QuadraticCost(lq_plant.W, 8.0 * np.asarray(lq_plant.R)))
+    whole, _ = on_the_log(wrong)
+    kept: dict[str, lq_plant.Array] = {}
+
+    def stop(done: int, *_: Any) -> None:
+        if done == 32:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        on_the_log(wrong, tell=stop, kept=kept)
+    ((name, gains),) = kept.items()
+    assert gains.shape == (4, 8)
+    kept[name] = np.concatenate([gains[:3], -gains[3:]])  # is believed: it is not tried again
+    changed, _ = on_the_log(wrong, kept=dict(kept))
+    assert not np.array_equal(changed.mpc.theta, whole.mpc.theta)
+    kept[name] = gains
+    again, _ = on_the_log(wrong, kept=kept)
+    np.testing.assert_array_equal(again.mpc.theta, whole.mpc.theta)
+    assert (again.gain, again.error, again.evaluations) == (whole.gain, whole.error, whole.evaluations)
+    other, _ = on_the_log(wrong, seed=1, kept={name: gains - 1e9})  # of another search
+    assert other.taken
 
 
 def test_the_best_controller_stays() -> None:

@@ -17,7 +17,7 @@ from plant_file import TEXT
 
 from mpcoffline import FileFormatError, OfflineMPCLearner
 from mpcoffline.learner.candidates import Candidates
-from mpcoffline.studies import zoo, zoo_page
+from mpcoffline.studies import lines, zoo, zoo_page
 from mpcoffline.studies.plant_files import PlantFile
 from mpcoffline.studies.zoo import Case, Outcome
 
@@ -67,7 +67,7 @@ def test_differences_are_paired() -> None:
 
 def test_warnings_are_heard(tmp_path: Path) -> None:
     said: list[str] = []
-    with zoo._heard(said):
+    with zoo.heard(said):
         warnings.warn("first", stacklevel=1)
         logging.getLogger("mpcoffline.learning").warning("second %d", 2)
     assert said == ["second 2", "first"]
@@ -75,25 +75,25 @@ def test_warnings_are_heard(tmp_path: Path) -> None:
 
 def test_results_survive_a_torn_line(tmp_path: Path) -> None:
     path = tmp_path / "zoo.csv"
-    assert zoo.read(path) == []
+    assert lines.read(path, Outcome) == []
     first, second = outcome(2.0, 1.0, said="a, b\nc"), outcome(-2.0, np.nan, seed=1, error="no")
-    zoo.append(path, first)
+    lines.append(path, first)
     whole = path.read_bytes()
-    zoo.append(path, second)
-    lines = path.read_bytes()
-    for size in range(len(whole), len(lines)):  # killed while it wrote the second
-        path.write_bytes(lines[:size])
-        zoo.append(path, outcome(5.0, 5.0, seed=7))
-        seeds = {o.seed for o in zoo.read(path)}
+    lines.append(path, second)
+    both = path.read_bytes()
+    for size in range(len(whole), len(both)):  # killed while it wrote the second
+        path.write_bytes(both[:size])
+        lines.append(path, outcome(5.0, 5.0, seed=7))
+        seeds = {o.seed for o in lines.read(path, Outcome)}
         assert {0, 7} <= seeds
-    path.write_bytes(lines)
-    zoo.append(path, outcome(-2.0, -3.0, seed=1))  # tried again
-    found = zoo.read(path)
+    path.write_bytes(both)
+    lines.append(path, outcome(-2.0, -3.0, seed=1))  # tried again
+    found = lines.read(path, Outcome)
     assert [(o.seed, o.mpc_1, o.error) for o in found] == [(0, 2.0, ""), (1, -2.0, "")]
     assert found[0].said == "a, b\nc"
     path.write_text("a,b\n1,2\n")
     with pytest.raises(FileFormatError, match="other columns"):
-        zoo.read(path)
+        lines.read(path, Outcome)
 
 
 def test_counts_know_no_sign_of_the_cost() -> None:
@@ -207,7 +207,7 @@ def test_the_script_skips_what_is_done_and_what_cannot_be(
     (tmp_path / "cart.py").write_text(TEXT)
     (tmp_path / "other.py").write_text("import no_such_package_here\n" + TEXT)
     out, page = tmp_path / "zoo.csv", tmp_path / "pages" / "zoo.md"
-    zoo.append(out, outcome(2.0, 1.0, 1.0))
+    lines.append(out, outcome(2.0, 1.0, 1.0))
     done: list[Case] = []
 
     def run_case(case: Case, tell: object) -> Outcome:

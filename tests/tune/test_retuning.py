@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from mpcoffline import FileFormatError, MPCPolicy
 from mpcoffline.cli import app
 from mpcoffline.datasets.logs.wanted import Wanted
 from mpcoffline.diagnostics import diagnose
+from mpcoffline.diagnostics.trial import TODAY, TRIED, stretched, widening
 from mpcoffline.tune import Calibration, Tuned, retune, tune
-from mpcoffline.tune.trial import TODAY, TRIED
 
 pytest.importorskip("polars")
 
@@ -89,6 +90,10 @@ def test_a_trial_of_a_changed_plant_is_far_outside_and_nothing_is_recommended(tu
     assert "FAR OUTSIDE" in found.sentences[0]
     assert "go back to what ran before" in found.sentences[1]
     assert after.tuned.verdict != "recommend"
+    # The next bands are as wide as this one would have had to be.
+    assert abs(found.off) > 2.0
+    assert f"{abs(found.off):.2g} times as wide" in " ".join(after.tuned.document["reasons"])
+    assert f"{abs(found.off):.2g} times as wide" in (copied / "report.html").read_text(encoding="utf-8")
     command = CliRunner().invoke(app, ["retune", str(tuned.folder / "controller"), str(Path(__file__))])
     assert command.exit_code == 1
     assert "a folder that tune has made" in command.stderr
@@ -120,6 +125,15 @@ def test_inside_outside_and_far_know_no_unit_and_no_zero(scale: float, offset: f
     assert not unknown.inside
     assert not unknown.far
     assert unknown.sentences[0].startswith("Nothing was predicted")
+
+
+def test_bands_become_as_wide_as_trials_were_off() -> None:
+    """By hand: off by 3 half widths of a band, and by 1 of one twice as wide: sqrt((9 + 4) / 2)."""
+    assert widening([]) == widening([(None, 1.0), (np.inf, 1.0)]) == widening([(0.4, 1.0), (-0.9, 1.0)]) == 1.0
+    assert widening([(-3.0, 1.0), (1.0, 2.0), (None, 5.0)]) == pytest.approx(np.sqrt(6.5))
+    assert stretched((9.0, 10.0, 14.0), 2.0) == (8.0, 10.0, 18.0)
+    found = replace(calibration(11.0, 9.0, 11.0, 13.0), widened=2.5)
+    assert Calibration.from_json(json.loads(json.dumps(found.to_json()))) == found
 
 
 def test_the_cost_of_todays_controller_is_that_of_its_own_episodes(tuned: Tuned) -> None:

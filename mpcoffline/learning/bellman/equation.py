@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
-from mpcoffline.estimation.identification import FULL_TURN, Rows, without_jumps
+from mpcoffline.estimation.rows import FULL_TURN, Rows, without_jumps
 from mpcoffline.learning.stages import KnownCost
 from mpcoffline.learning.value.fit import ValueFunction
 from mpcoffline.mpc import MPC

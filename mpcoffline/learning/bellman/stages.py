@@ -85,7 +85,7 @@ def identified(known: Known, config: StartConfig) -> Known:
         return known
     tried = ["dead times"] if config.delays and known.value_function is None else []
     rows = as_logged(known.mpc, known.table, known.cost)
-    found, table = identify_as_logged(known.mpc, known.table, rows, tried=tried, seed=known.seed)
+    found, table = identify_as_logged(known.mpc, known.table, rows, tried=tried, seed=known.seed, start=known.start)
     known = replace(known, table=table, found=found)
     if "model" not in known.groups:
         return known

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from mpcoffline.core.parallel import EXECUTORS, Executor, n_cpus
+from mpcoffline.core.parallel import Executor, chosen, n_cpus
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.plan import Plan
@@ -62,7 +62,7 @@ class WorkerPool:
         wanted = min(self._n_workers, n, n_cpus())
         if self._workers is None or wanted > self._n_started:
             self.close()
-            self._workers, self._n_started = EXECUTORS["processes"](self._task, wanted), wanted
+            self._workers, self._n_started = chosen()(self._task, wanted), wanted
         try:
             found = self._workers.map(jobs)
         except BaseException:  # Ctrl-C, a worker that died: no process stays behind, the next batch starts new ones

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -15,7 +15,6 @@ from mpcoffline.core.text import figure
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.diagnostics.differences import SURE, outvoted
 from mpcoffline.estimation import Identification
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
@@ -25,6 +24,8 @@ from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
 from mpcoffline.simulation.starts import returns_along, signals_along
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Controller, Surroundings
+
+from .differences import SURE, outvoted
 
 TRIED, TODAY = "the controller of the trial", "today's controller (clone)"
 _WINDOWS, _LOOPS = 32, 96  # stretches of the trial, closed loops on a model in all
@@ -49,6 +50,7 @@ class Calibration:
         promised: What the verdict expected from the starts of its own log, in as many steps; None where it had none.
         models: How many models were asked.
         others: Share of the rows of the trial in which another input was applied than the controller decides.
+        widened: How many times as wide as the models alone say the bands are, since trials before lay outside theirs.
     """
 
     steps: int
@@ -58,6 +60,7 @@ class Calibration:
     promised: Band | None
     models: int
     others: float = 0.0
+    widened: float = 1.0
 
     @property
     def band(self) -> Band:
@@ -160,7 +163,8 @@ class Calibration:
         promised = None if data["promised"] is None else _numbers(data["promised"])
         predicted = {str(name): _numbers(band) for name, band in data["predicted"].items()}
         counts = int(data["steps"]), int(data["stretches"])
-        return cls(*counts, float(data["seen"]), predicted, promised, int(data["models"]), float(data["others"]))
+        shares = float(data["others"]), float(data.get("widened", 1.0))
+        return cls(*counts, float(data["seen"]), predicted, promised, int(data["models"]), *shares)
 
     def to_json(self) -> dict[str, Any]:
         """For files."""
@@ -182,6 +186,7 @@ def compared(
     expected: tuple[Band, int] | None = None,
     today: int | None = None,
     seed: int = 0,
+    widened: float = 1.0,
 ) -> Calibration:
     """Predicts what a trial costs by models of the log before it, and compares with what was seen.
 
@@ -198,6 +203,7 @@ def compared(
         expected: What the verdict expected, and in how many steps.
         today: How many episodes of the log, the first ones, today's controller made; all by default.
         seed: Of models, stretches and disturbances.
+        widened: How many times as wide the bands become: what :func:`widening` says of trials before.
 
     Raises:
         InvalidDataError: If the trial has no stretch of which all is known, or other columns.
@@ -207,7 +213,8 @@ def compared(
     layout, nominal = learned.layout, given.with_delay(learned.layout.delay)
     table, tried = with_memory(log, layout), with_memory(trial, layout)
     known = None if learner.result is None else learner.result.cost
-    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed)
+    rows = as_logged(learned, table, known)
+    found, clean = identify_as_logged(nominal, table, rows, seed=seed, start=learner.start)
     policies = {TRIED: quick_policy(running), FIRST: quick_policy(given)}
     slow = are_slow(policies.values())
     around, starts = _surroundings(learned, given, (log, table, clean), tried, found, slow, seed + _TRIAL)
@@ -217,7 +224,7 @@ def compared(
     controllers: dict[str, Controller] = {**policies, TODAY: clone}
     levels = _levels(around, clone, table, votes, own)
     predicted = {
-        name: _band(episodes.cost[votes].reshape(int(votes.sum()), -1, n), levels)
+        name: stretched(_band(episodes.cost[votes].reshape(int(votes.sum()), -1, n), levels), widened)
         for name, episodes in zip(controllers, around.act(list(controllers.values())), strict=True)
     }
     seen = float(np.mean(returns_along(tried, starts, steps)))
@@ -225,7 +232,30 @@ def compared(
     if expected is not None and np.isfinite(expected[0]).all():
         low, middle, high = (float(v) * steps / expected[1] for v in expected[0])
         promised = low, middle, high
-    return Calibration(steps, n, seen, predicted, promised, int(votes.sum()), _others(running, tried))
+    return Calibration(steps, n, seen, predicted, promised, int(votes.sum()), _others(running, tried), widened)
+
+
+def widening(trials: Iterable[tuple[float | None, float]]) -> float:
+    """How many times as wide as the models alone say a band has to be, after some trials; at least 1.
+
+    ::
+
+        w = max(1, sqrt(mean_i (o_i w_i)^2))
+
+    with o_i how far trial i lay from the middle of its band, in half widths, and w_i how many times as wide that was.
+
+    Args:
+        trials: o_i and w_i of each, as :attr:`Calibration.off` and :attr:`Calibration.widened`; None, and what is not
+            finite, tells nothing.
+    """
+    off = np.array([o * w for o, w in trials if o is not None and np.isfinite(o)])
+    return max(1.0, float(np.sqrt(np.mean(off**2)))) if len(off) else 1.0
+
+
+def stretched(band: Band, factor: float) -> Band:
+    """A band so many times as wide, to either side of its middle."""
+    low, middle, high = band
+    return middle - factor * (middle - low), middle, middle + factor * (high - middle)
 
 
 def _surroundings(
