@@ -23,6 +23,7 @@ _ROUNDS = (1 / 8, 1 / 3, 5 / 8)  # of the usual starts until the end of each; wh
 _CLEAR = 2.0  # standard errors
 _TRIFLE = 0.01  # of the gain over MPC_1: what is better by less is no better
 _TOGETHER = 4  # MPCs whose closed loops are stepped together: much faster, and something is told in between
+_RETRIED = 0.1  # of the solves
 _JUDGED = 3  # of the best at most, one after the other
 _VARIED = (3, 1)  # of so many of the best, variants are tried after each of the first rounds
 
@@ -205,10 +206,12 @@ def are_slow(policies: Iterable[MPCPolicy]) -> bool:
 def quick_policy(mpc: MPC) -> MPCPolicy:
     """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem.
 
-    It takes as many threads as torch does, which change no digit.
+    It takes as many threads as torch does, which change no digit. Of its solves few are retried: an MPC of which many
+    fail is no good one.
     """
     if "ddp" in SOLVERS and not SOLVERS["ddp"].refuses(mpc):
         policy = MPCPolicy(mpc, "ddp", n_threads=torch.get_num_threads())
+        policy.retry_at_most(_RETRIED)
         with contextlib.suppress(CompilerError):
             _ = policy.solver
             return policy

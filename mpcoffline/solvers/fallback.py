@@ -94,6 +94,9 @@ _ZERO = _Answer("n_zero", "by zero", "applying zero, within the bounds")
 _ANSWERS = (_RETRIED, _RESCUED, _BEST, _PREVIOUS, _ZERO)
 
 
+_ANYHOW = 1_000  # problems
+
+
 class Fallback:
     """Answers the problems that a solver did not solve.
 
@@ -115,6 +118,7 @@ class Fallback:
 
     Attributes:
         stats: Counts of all solves.
+        most_retried: Which share of the problems is retried at most, beyond the first thousand; all by default.
 
     Raises:
         UnknownIdError: For another rescue.
@@ -128,6 +132,7 @@ class Fallback:
             raise InvalidArgumentError("rescue_time", expected="a positive number of seconds", actual=str(rescue_time))
         self.mpc, self.rescue, self.rescue_time = mpc, rescue, float(rescue_time)
         self.stats = SolverStats()
+        self.most_retried, self._n_tried_again = 1.0, 0
         self._rescuer: IpoptSolver | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -153,7 +158,11 @@ class Fallback:
         found = _Found(solver, states, Plan(solution.x[rows].copy(), solution.u[rows].copy()), solution.value[rows])
         reasons = np.array(solution.words)[rows]
         tried = np.broadcast_to(solution.stats.get("all_starts", False), len(x))[rows]
-        retried = found.improve(before.known & ~tried, lambda some: self._solve(solver, states[some], None))
+        again = before.known & ~tried
+        if self._n_tried_again > _ANYHOW + self.most_retried * self.stats.n_solves:
+            again[:] = False
+        self._n_tried_again += int(again.sum())
+        retried = found.improve(again, lambda some: self._solve(solver, states[some], None))
         rescued = np.zeros_like(retried)
         if self.rescue is not None and not isinstance(solver, IpoptSolver):
             rescued = found.improve(~retried, lambda some: self._solve(self._oracle, states[some], found.part(some)))

@@ -89,6 +89,25 @@ def test_a_warm_failure_is_tried_once_from_all_starts_and_it_alone(
     assert answers(scripted.solver_stats) == {"retried": 1}
 
 
+def test_an_mpc_whose_solves_fail_again_and_again_is_retried_for_a_part(
+    scripted: MPCPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mpcoffline.solvers.fallback._ANYHOW", 4)
+    scripted.retry_at_most(0.25)
+    answering(monkeypatch, lambda x, warm: (x, 1.0, not warm))
+    state, tried = None, []
+    for _ in range(7):
+        Scripted.calls.clear()
+        _, state = scripted.predict([[0.1, 0.0], [0.2, 0.0]], state)
+        tried.append(list(Scripted.calls))
+    # Two are tried again as long as no more than 4 and a quarter of 2, 4, 6, ... problems have been before.
+    assert tried == [[2], [2, 2], [2, 2], [2, 2], [2, 2], [2], [2]]
+    assert scripted.solver_stats.n_retried == 8
+    assert scripted.solver_stats.n_best_plan == 4
+    with pytest.raises(InvalidArgumentError, match="share"):
+        scripted.retry_at_most(1.5)
+
+
 @pytest.mark.parametrize(
     ("warm_value", "cold_value", "expected"),
     [(1.0, 2.0, 0.2), (2.0, 1.0, 0.6), (np.nan, 5.0, 0.6), (5.0, np.inf, 0.2), (-3.0, -2.0, 0.2)],
