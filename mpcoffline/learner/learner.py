@@ -265,6 +265,7 @@ class OfflineMPCLearner:
         """As :meth:`fit`, but yields ``(epoch, metrics)`` at the end of each epoch; the caller may stop between."""
         for name in evaluators or {}:
             check_name("evaluator", name)
+        check_callbacks(callbacks)
         check_also(self.nominal_mpc, also or {})
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
@@ -283,7 +284,7 @@ class OfflineMPCLearner:
             for callback in callbacks:
                 if (end := getattr(callback, "on_fit_end", None)) is not None:
                     ending.callback(end)
-            for epoch in run.epochs(n_steps_per_epoch):
+            for epoch in run.epochs(n_steps_per_epoch, bars.busy):
                 self.value_function, self.result = run.value_function, run.result
                 self._mpc, self._policy, self._observation_space = self._ready(run), None, observation_space
                 metrics = dict(epoch.metrics)
@@ -300,6 +301,7 @@ class OfflineMPCLearner:
                 if any(_asks_to_end(answer) for answer in answers):
                     break
             if run.learned is not None:
+                bars.busy("models of the log")
                 self.candidates = candidates_of(self, run, table, bars, also or {})
                 self._policy = None
             self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
@@ -372,6 +374,19 @@ class OfflineMPCLearner:
                 known here.
         """
         return read_learner(cls, path)
+
+
+def check_callbacks(callbacks: Sequence[object]) -> None:
+    """Refuses what cannot be called, before anything is learned.
+
+    Raises:
+        InvalidArgumentError: For one that is no function; SB3's are told how they become one.
+    """
+    for callback in callbacks:
+        if not callable(callback):
+            hint = "One of Stable-Baselines3's goes in as mpcoffline.sb3.SB3Callback(callback)."
+            expected = "functions (learner, epoch, total_step)"
+            raise InvalidArgumentError("callbacks", expected=expected, actual=repr(callback)[:200], hint=hint)
 
 
 def _asks_to_end(answer: Any) -> bool:
