@@ -13,7 +13,7 @@ from mpcoffline.plants import PlantEnv
 from .described import quantities_of
 from .panels import task_of
 from .signals import draw_signal, signals_of
-from .style import PAGE_WIDTH, legend_handles, new_figure, paper_style
+from .style import PAGE_WIDTH, legend_handles, new_figure, paper_style, time_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,15 +50,16 @@ def loop_figure(loops: Mapping[str, Evaluation], env: gym.Env[Any, Any] | str, e
         signals, dt, seconds = signals_of(plant, states, actions), task.dt, plant.seconds
     known = [*(["set-point, disturbance"] if any(s.course is not None for s in signals) else [])]
     known += ["limit"] if any(s.limits for s in signals) else []
+    length = dt * max(len(s) - 1 for s in states.values())
+    unit, name = time_unit(length)
     with paper_style():
         figure = new_figure(0.75 * PAGE_WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * len(signals))
         panels = np.atleast_1d(figure.subplots(len(signals), 1, sharex=True))
         for axes, signal in zip(panels, signals, strict=True):
-            draw_signal(axes, signal, dt)
+            draw_signal(axes, signal, dt / unit)
         figure.align_ylabels()
-        panels[-1].set_xlabel("time (s)")
-        length = dt * max(len(s) - 1 for s in states.values())
-        panels[-1].set_xlim(0.0, min(length, seconds or length))
+        panels[-1].set_xlabel(f"time ({name})")
+        panels[-1].set_xlim(0.0, min(length, seconds or length) / unit)
         handles, names = legend_handles([*loops, *known])
         figure.legend(handles, names, loc="outside upper center", ncols=len(names), handlelength=3.2)
     return figure

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 COLUMN_WIDTH = 3.5
 PAGE_WIDTH = 7.16
 _PNG_DPI = 200
+_TIMES = ((1.0, "s", 600.0), (60.0, "min", 6 * 3600.0), (3600.0, "h", float("inf")))  # and to which length each
 _INDEXED = re.compile(r"([A-Za-z]+)_(\d+)")
 
 
@@ -138,6 +139,11 @@ def legend_handles(names: Sequence[str]) -> tuple[list[Any], list[str]]:
 
     handles = [Line2D([], [], **line_of((STYLES | OTHERS).get(name, OTHER))) for name in names]
     return handles, [controller_label(name) for name in names]
+
+
+def time_unit(seconds: float) -> tuple[float, str]:
+    """In which unit a stretch of time is drawn: how many seconds it has, and its name."""
+    return next((unit, name) for unit, name, most in _TIMES if seconds <= most)
 
 
 def line_of(style: LineStyle) -> dict[str, Any]:
