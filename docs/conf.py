@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import tempfile
-from importlib.metadata import version as installed_version
+from importlib.metadata import metadata, version as installed_version
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -28,10 +28,13 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
     "command_help",
     "markdown_docstrings",
+    "page_meta",
+    "results_pages",
 ]
 exclude_patterns = ["**/make_*.py"]
 nitpicky = True
@@ -46,7 +49,10 @@ nitpick_ignore_regex = [
 
 myst_enable_extensions = ["amsmath", "attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
-suppress_warnings = ["mystnb.unknown_mime_type"]
+suppress_warnings = [
+    "mystnb.unknown_mime_type",
+    "ref.python",  # types in signatures that two modules have a name for: their pages are linked by hand
+]
 copybutton_exclude = ".linenos, .gp, .go"
 
 # --- Docstrings -----------------------------------------------------------------------------------------------------
@@ -56,7 +62,8 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 autodoc_type_aliases = {"ArrayLike": "ArrayLike", "NDArray": "NDArray"}  # as they are written, not expanded
 TypeAliasForwardRef.__repr__ = lambda self: self.name  # ... in unions, too
-autodoc_typehints = "description"
+autodoc_typehints = "both"
+python_maximum_signature_line_length = 88
 autodoc_typehints_format = "short"
 autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
@@ -91,13 +98,19 @@ os.environ["MINARI_DATASETS_PATH"] = _STORE.name
 # --- Pages ----------------------------------------------------------------------------------------------------------
 
 html_theme = "furo"
-html_title = "mpcoffline"
+html_title = f"mpcoffline {version}"
 html_logo = html_favicon = "_static/logo.svg"
 pygments_dark_style = "github-dark"
 html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 html_copy_source = False
 html_show_sphinx = False
+html_theme_options = {}
+# The address of the repository, where pyproject.toml has one: links to it, and to each page's text.
+for _line in metadata("mpcoffline").get_all("Project-URL") or []:
+    _name, _, _address = _line.partition(", ")
+    if _name == "Repository":
+        html_theme_options |= {"source_repository": _address, "source_branch": "main", "source_directory": "docs/"}
 
 # MathJax from its installed package: pages load nothing from the network.
 _MATHJAX = Path(importlib.util.find_spec("mathjax").submodule_search_locations[0]) / "static" / "mathjax" / "es5"

@@ -1,7 +1,8 @@
 """What the commands share: errors as one line, exit codes, JSON for machines, and how files are found.
 
 Exit codes: 0 done; 1 an error with a message, or something wrong in what was to be checked; 2 a command line that is
-none; 130 interrupted by Ctrl-C. Results go to stdout, progress and messages to stderr.
+none, or the value of an option that is none; 130 interrupted by Ctrl-C. Results go to stdout, progress and messages to
+stderr.
 """
 
 from __future__ import annotations
@@ -9,25 +10,28 @@ from __future__ import annotations
 import difflib
 import io
 import json
+import re
 import sys
 from collections.abc import Iterable
-from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import rich
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.containers import Lines
 from rich.markup import escape
 from rich.segment import Segment
+from rich.status import Status
+from rich.text import Text
 from typer.core import TyperGroup
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError, UnknownIdError, visible
 from mpcoffline.core.outputs import check_output
 from mpcoffline.envs import PLANTS, ControlTask
 
-from .others import AddedCommand, added_commands, import_plants
+from .others import AddedCommand, added_commands
 
 if TYPE_CHECKING:
     from gymnasium import Env
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
     from mpcoffline.learner.learner import OfflineMPCLearner
 
 USER_ERROR = 1
+USAGE_ERROR = 2
 INTERRUPTED = 130
 
 
@@ -50,67 +55,6 @@ class SafeConsole(Console):
 
 console = SafeConsole()
 messages = SafeConsole(stderr=True, soft_wrap=True, highlight=False)
-
-
-import_plants()
-Task = StrEnum("Task", {plant.name: plant.name for plant in PLANTS.values()})  # type: ignore[misc]
-
-
-class Preset(StrEnum):
-    """The presets of a learner, ``mpcoffline.learner.presets.PRESETS``."""
-
-    paper = "paper"
-    default = "default"
-    fast = "fast"
-    best = "best"
-
-
-class Start(StrEnum):
-    """The kinds of start."""
-
-    broad = "broad"
-    hanging = "hanging"
-
-
-def _checked_value(given: str | None) -> str | None:
-    """Refuses what is no method of (VALUE); torch is imported where there is one to look at."""
-    if given is not None and given not in (known := _value_methods()):
-        raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}.")
-    return given
-
-
-def _value_methods() -> list[str]:
-    from mpcoffline.learning import VALUE_METHODS
-
-    return ["auto", *VALUE_METHODS]
-
-
-Value = Annotated[
-    str | None,
-    typer.Option(
-        help="Method of (VALUE), e.g. residual, the published one, or auto.",
-        metavar="METHOD",
-        show_default="the preset's",
-        callback=_checked_value,
-        autocompletion=_value_methods,
-    ),
-]
-TaskArgument = Annotated[Task, typer.Argument(help="Which task.", show_default=False)]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
-Alpha = Annotated[
-    float,
-    typer.Option(help="Size of the model error: of the plant (linear) or of the MPC's model (swing-ups).", min=0.0),
-]
-PlantAlpha = Annotated[
-    float | None, typer.Option("--alpha", help="Plant of the linear task.", show_default="1.0", min=0.0, max=4.0)
-]
-Controller = Annotated[
-    Path, typer.Argument(help="A saved policy or learner (.zip).", exists=True, dir_okay=False, show_default=False)
-]
-LearnerFile = Annotated[
-    Path, typer.Argument(help="A saved learner (.zip).", exists=True, dir_okay=False, show_default=False)
-]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, for machines.")]
 
 
 class ErrorGroup(TyperGroup):
@@ -152,8 +96,19 @@ class ErrorGroup(TyperGroup):
         except BrokenPipeError:  # the reader has seen enough: no error
             raise
         except (MPCOfflineError, gym.error.Error, OSError) as error:
-            messages.print(f"[bold red]Error:[/] {escape(str(error))}")
-            raise typer.Exit(USER_ERROR) from error
+            message(Text.assemble(("Error:", "bold red"), " ", visible(str(error))))
+            raise typer.Exit(
+                USAGE_ERROR if _of_an_option(error, ctx.invoked_subcommand, self) else USER_ERROR
+            ) from error
+
+
+def _of_an_option(error: Exception, called: str | None, group: ErrorGroup) -> bool:
+    """Whether an error is of an argument that is an option of the command."""
+    if not isinstance(error, InvalidArgumentError):
+        return False
+    command = group.commands.get(called or "")
+    known = {option for each in getattr(command, "params", ()) for option in each.opts}
+    return error.name in known or f"--{error.name.replace('_', '-')}" in known
 
 
 def examples(*lines: str) -> str:
@@ -173,9 +128,43 @@ def print_json(document: Any) -> None:
     typer.echo(json.dumps(plain(document), indent=2, allow_nan=False))
 
 
+def working(what: str) -> Status:
+    """A sign of life on a terminal while something loads or is computed; to be entered before what it is a sign of."""
+    return messages.status(what)
+
+
+def message(text: str | Text) -> None:
+    """A message on stderr: on a terminal broken between words, elsewhere one line."""
+    _print_prose(messages, Text(visible(text)) if isinstance(text, str) else text)
+
+
 def say(text: str) -> None:
     """A line on stdout that is never wrapped, so that paths and commands in it can be copied."""
     console.print(text, highlight=False, soft_wrap=True)
+
+
+def say_prose(text: str | Text) -> None:
+    """Sentences on stdout: on a terminal broken between words, elsewhere as they are."""
+    _print_prose(console, Text(visible(text)) if isinstance(text, str) else text)
+
+
+def _print_prose(where: Console, text: Text) -> None:
+    lines = text.split("\n", allow_blank=True)
+    if where.is_terminal:
+        lines = Lines(part for line in lines for part in line.divide(_breaks(line.plain, where.width)))
+    for line in lines:
+        line.rstrip()
+        where.print(line, highlight=False, soft_wrap=True)
+
+
+def _breaks(line: str, width: int) -> list[int]:
+    """Where a line is to go on in the next one: in front of a word that does not fit; a longer word than that stays."""
+    found, begin = [], 0
+    for word in re.finditer(r"\S+", line):
+        if word.end() - begin > width and line[begin : word.start()].strip():
+            begin = word.start()
+            found.append(begin)
+    return found
 
 
 def say_file(what: str, path: Path) -> None:
@@ -185,43 +174,59 @@ def say_file(what: str, path: Path) -> None:
 
 def loaded_policy(path: Path) -> MPCPolicy:
     """The policy in a policy's or learner's file."""
-    from mpcoffline.control.policy import MPCPolicy
+    with working("Loading"):
+        from mpcoffline.control.policy import MPCPolicy
 
-    return MPCPolicy.load(path)
+        return MPCPolicy.load(path)
 
 
 def loaded_learner(path: Path) -> OfflineMPCLearner:
-    """The learner in a file; a policy's file is told apart from a damaged one."""
-    from mpcoffline.core.archive import holds
-    from mpcoffline.learner.learner import OfflineMPCLearner
+    """The learner in a file; a policy's file is told apart from a damaged one, and the learner beside it named."""
+    with working("Loading"):
+        from mpcoffline.core.archive import holds
 
-    if holds(path, "policy"):
-        raise FileFormatError(
-            str(path),
-            expected="a learner",
-            actual="a policy, which does not know what it was learned from",
-            hint="Give the learner's file; `mpcoffline learn` writes it beside the policy.",
-        )
-    return OfflineMPCLearner.load(path)
+        if holds(path, "policy"):
+            stem = path.stem.removesuffix("_policy")
+            beside = [each for each in (f"{stem}_learner.zip", f"{stem}.zip", "learner.zip") if each != path.name]
+            found = [path.with_name(each) for each in beside if path.with_name(each).is_file()]
+            hint = f"Its learner may be {found[0]}." if found else "`mpcoffline learn` writes one beside the policy."
+            raise FileFormatError(
+                str(path),
+                expected="a learner",
+                actual="a policy, which does not know what it was learned from",
+                hint=hint,
+            )
+        from mpcoffline.learner.learner import OfflineMPCLearner
+
+        return OfflineMPCLearner.load(path)
 
 
-def made_environment(env_id: str, alpha: float | None, start: Start | None) -> Env[Any, Any]:
-    """The environment; options that it does not know are refused before anything is solved."""
+def made_environment(env: str, alpha: float | None, start: str | None) -> Env[Any, Any]:
+    """The environment of an id or a plant file; options that it does not know are refused before anything is solved."""
     import gymnasium as gym
 
-    try:
-        env: Env[Any, Any] = gym.make(env_id) if alpha is None else gym.make(env_id, alpha=alpha)
-    except gym.error.UnregisteredEnv as error:
-        nearest = difflib.get_close_matches(env_id, [plant.id for plant in PLANTS.values()], n=1, cutoff=0.3)
-        hint = f"Did you mean {nearest[0]!r}?" if nearest else ""
-        raise UnknownIdError("--env", expected="a registered environment", actual=repr(env_id), hint=hint) from error
-    except TypeError as error:
-        raise InvalidArgumentError("--alpha", expected=f"none for {env_id}", actual=str(alpha)) from error
-    task = env.unwrapped
+    if env.endswith(".py"):
+        with working("Loading"):
+            from mpcoffline.plants import load_plant
+
+            if alpha is not None:
+                raise InvalidArgumentError("--alpha", expected="none for a plant file", actual=str(alpha))
+            made = load_plant(env).env()
+    else:
+        try:
+            made = gym.make(env) if alpha is None else gym.make(env, alpha=alpha)
+        except gym.error.UnregisteredEnv as error:
+            nearest = difflib.get_close_matches(env, [plant.id for plant in PLANTS.values()], n=1, cutoff=0.3)
+            hint = f"Did you mean {nearest[0]!r}?" if nearest else ""
+            expected = "a registered environment, or a plant file (.py)"
+            raise UnknownIdError("--env", expected=expected, actual=repr(env), hint=hint) from error
+        except TypeError as error:
+            raise InvalidArgumentError("--alpha", expected=f"none for {env}", actual=str(alpha)) from error
+    task = made.unwrapped
     known = task.starts if isinstance(task, ControlTask) else ()
-    if start is not None and start.value not in known:
-        raise InvalidArgumentError("--start", expected=f"one of {known} for {env_id}", actual=repr(start.value))
-    return env
+    if start is not None and start not in known:
+        raise InvalidArgumentError("--start", expected=f"one of {known} for {env}", actual=repr(start))
+    return made
 
 
 def check_figure(option: str, path: Path) -> None:
@@ -233,7 +238,7 @@ def check_figure(option: str, path: Path) -> None:
         raise InvalidArgumentError(option, expected=f"a file ending in .{', .'.join(sorted(known))}", actual=str(path))
 
 
-def check_out(option: str, path: Path, *, make: bool = False) -> None:
+def check_out(option: str, path: Path, *, make: bool = True) -> None:
     """Refuses a file that could not be written: before the work, not after it. ``make`` if its folder will be made."""
     if not make and not path.parent.is_dir():
         raise InvalidArgumentError(option, expected="a file in a folder that exists", actual=str(path))

@@ -11,13 +11,21 @@ from rich.markup import escape
 
 from mpcoffline.core.tables import Table
 
-from .common import Json, check_figure, check_out, console, examples, print_json, say
+from .common import check_figure, check_out, console, examples, print_json, say_prose, working
+from .options import Json, beginning, dataset_ids
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="The data sets on this machine.")
 
 FOUND_WRONG = 1
 
-Id = Annotated[str, typer.Argument(help="Data set id, e.g. mpcoffline/pendulum/ddpg-v0.", show_default=False)]
+Id = Annotated[
+    str,
+    typer.Argument(
+        help="Data set id, e.g. mpcoffline/pendulum/ddpg-v0.",
+        show_default=False,
+        autocompletion=beginning(dataset_ids),
+    ),
+]
 Remote = Annotated[
     str | None,
     typer.Option(help="hf://ORGANISATION or gcp://BUCKET.", show_default="the catalogue's, or MINARI_REMOTE"),
@@ -27,7 +35,8 @@ Remote = Annotated[
 @app.command("list", epilog=examples("mpcoffline datasets list", "mpcoffline datasets list --json"))
 def list_(as_json: Json = False) -> None:
     """The data sets that can be learned from: shipped with the package, or in the local Minari store."""
-    from mpcoffline.datasets import list_datasets
+    with working("Loading"):
+        from mpcoffline.datasets import list_datasets
 
     rows = list_datasets()
     if as_json:
@@ -49,7 +58,8 @@ def show(
     as_json: Json = False,
 ) -> None:
     """The card and the statistics of a data set."""
-    from mpcoffline.datasets import show as summarise
+    with working("Loading"):
+        from mpcoffline.datasets import show as summarise
 
     if figure is not None:
         check_figure("--figure", figure)
@@ -81,7 +91,8 @@ def verify(
 
     Exit code 1 if something is wrong.
     """
-    from mpcoffline.datasets import verify as check
+    with working("Loading"):
+        from mpcoffline.datasets import verify as check
 
     report = check(dataset_id, accept=accept)
     console.print(report)
@@ -100,7 +111,8 @@ def replay(
 
     Exit code 1 if it is more than rounding.
     """
-    from mpcoffline.datasets import replay as simulate
+    with working("Loading"):
+        from mpcoffline.datasets import replay as simulate
 
     report = simulate(dataset_id, episodes, allow_import=allow_import, progress=True)
     console.print(report)
@@ -115,9 +127,10 @@ def repair(
     ] = False,
 ) -> None:
     """Finish or rebuild what a killed recording left; what is found is kept as a backup."""
-    from mpcoffline.datasets import repair as mend
+    with working("Loading"):
+        from mpcoffline.datasets import repair as mend
 
-    say(escape(str(mend(dataset_id, salvage=salvage))))
+    say_prose(str(mend(dataset_id, salvage=salvage)))
 
 
 @app.command(epilog=examples("mpcoffline datasets download mine/plant/log-v0 --remote hf://my-organisation"))
@@ -133,7 +146,8 @@ def download(
     ] = False,
 ) -> None:
     """Bring a data set from a Minari remote into the local store; goes on where an earlier attempt broke off."""
-    from mpcoffline.datasets import download_dataset
+    with working("Loading"):
+        from mpcoffline.datasets import download_dataset
 
     dataset = download_dataset(
         dataset_id, remote=remote, revision=revision, overwrite=overwrite, unchecked=unchecked, progress=True
@@ -144,6 +158,7 @@ def download(
 @app.command(epilog=examples("mpcoffline datasets upload mine/pendulum/first-v0 --remote hf://my-organisation"))
 def upload(dataset_id: Id, remote: Remote = None) -> None:
     """Put a data set on a Minari remote, with the hashes that a download is checked against."""
-    from mpcoffline.datasets import upload_dataset
+    with working("Loading"):
+        from mpcoffline.datasets import upload_dataset
 
-    say(escape(str(upload_dataset(dataset_id, remote=remote))))
+    say_prose(str(upload_dataset(dataset_id, remote=remote)))

@@ -12,7 +12,8 @@ from rich.markup import escape
 from mpcoffline.core.errors import StorageError, visible
 from mpcoffline.core.outputs import write_file
 
-from .common import Json, Seed, check_out, console, examples, print_json, say, say_file
+from .common import check_out, console, examples, print_json, say, say_file, say_prose, working
+from .options import Json, Seed
 
 if TYPE_CHECKING:
     from mpcoffline.datasets.logs.reading import LoggedTable
@@ -24,7 +25,11 @@ app = typer.Typer()
 PlantFile = Annotated[
     Path,
     typer.Argument(
-        metavar="PLANT.py", help="Your plant file (Python); it is run.", exists=True, dir_okay=False, show_default=False
+        metavar="PLANT.py",
+        help="Your plant file (Python); it is run.",
+        exists=True,
+        dir_okay=False,
+        show_default=False,
     ),
 ]
 Logs = Annotated[
@@ -132,12 +137,14 @@ def check(
     Exits with 1 where something is to be mended first.
     """
     options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
-    from mpcoffline.plants import load_plant
-    from mpcoffline.tune import check_log
+    with working("Reading log and description"):
+        from mpcoffline.plants import load_plant
+        from mpcoffline.tune import check_log
 
-    plant = load_plant(file)
-    table = plant.read(logs, **options)
-    found = check_log(plant, table, seed=seed)
+        plant = load_plant(file)
+        table = plant.read(logs, **options)
+    with working("Comparing them"):
+        found = check_log(plant, table, seed=seed)
     if as_json:
         print_json(_document(plant, table, found))
     else:
@@ -185,14 +192,14 @@ def _show(found: LogCheck) -> None:
     from rich.text import Text
 
     style = "bold red" if found.problems else "bold green"
-    console.print(Text(visible(found.verdict), style=style))
-    console.print(Text(f"\n{visible(found.head)}\n"))
+    say_prose(Text(visible(found.verdict), style=style))
+    say_prose(f"\n{found.head}\n")
     for kind, title in (("problem", "To be mended first"), ("advice", "Advice"), ("good", "Good")):
         chosen = [each for each in found.remarks if each.kind == kind and each.about != "gain"]
         if chosen:
             console.print(Text(title, style="bold"))
             for each in chosen:
-                console.print(Text.assemble("* ", (f"{visible(each.about)}: ", "bold"), visible(each.text)))
+                say_prose(Text.assemble("* ", (f"{visible(each.about)}: ", "bold"), visible(each.text)))
             console.print()
     for table in found.tables:
         console.print(table)

@@ -8,10 +8,13 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
+from rich.text import Text
 
+from mpcoffline.core.errors import visible
 from mpcoffline.core.tables import Table
 
-from .common import Alpha, PlantAlpha, Preset, Seed, TaskArgument, Value, console, examples, say, say_file
+from .common import console, examples, say, say_file, say_prose, working
+from .options import Alpha, PlantAlpha, Preset, Seed, TaskArgument, Value, beginning, dataset_ids
 
 app = typer.Typer()
 
@@ -21,7 +24,7 @@ _BLOCKS = 10
 @app.command(
     epilog=examples(
         "mpcoffline run pendulum",
-        "mpcoffline run cartpole --alpha 1.5 --seed 3 --output results/cartpole-15",
+        "mpcoffline run cartpole --alpha 1.5 --seed 3 --out results/cartpole-15",
         "mpcoffline run pendulum --preset default",
     )
 )
@@ -29,13 +32,16 @@ def run(
     task: TaskArgument,
     alpha: Alpha = 1.0,
     seed: Seed = 0,
-    dataset: Annotated[str | None, typer.Option(help="Data set id.", show_default="the task's DDPG data")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Data set id.", show_default="the task's DDPG data", autocompletion=beginning(dataset_ids)),
+    ] = None,
     episodes: Annotated[int, typer.Option(help="Closed-loop episodes of each controller.", min=1)] = 24,
     value: Value = None,
     preset: Annotated[Preset, typer.Option(help="How MPC_2 and MPC_3 are learned; paper is the published recipe.")] = (
         Preset.paper
     ),
-    output: Annotated[
+    out: Annotated[
         Path | None, typer.Option(help="Folder for table and figure.", show_default="results/TASK", file_okay=False)
     ] = None,
 ) -> None:
@@ -45,12 +51,13 @@ def run(
     three then control the task from the same starts. Writes a table (results.md, .csv, .json), a figure (figure.pdf,
     .png) and the controllers (controllers/*.zip).
     """
-    from mpcoffline.studies import run_task
+    with working("Loading"):
+        from mpcoffline.studies import run_task
 
     options: dict[str, Any] = {} if preset is Preset.paper else {"preset": preset.value}
     if value is not None:
         options["value"] = value
-    folder = output or Path("results") / task.value
+    folder = out or Path("results") / task.value
     result = run_task(
         task.value,
         alpha=alpha,
@@ -62,32 +69,31 @@ def run(
     )
     console.print(result.table())
     for note in result.notes():
-        console.print(f"  {escape(note)}", highlight=False, style="dim")
+        say_prose(Text(f"  {visible(note)}", style="dim"))
     for what, name in (("Table", "results.md"), ("Figure", "figure.png"), ("Controllers", "controllers")):
         say_file(what, folder / name)
 
 
 @app.command(
-    epilog=examples("mpcoffline reproduce", "mpcoffline reproduce --alpha 1.5 --seed 3 --output results/paper-15")
+    epilog=examples("mpcoffline reproduce", "mpcoffline reproduce --alpha 1.5 --seed 3 --out results/paper-15")
 )
 def reproduce(
     alpha: Alpha = 1.0,
     seed: Seed = 0,
     episodes: Annotated[int, typer.Option(help="Closed-loop episodes of each controller.", min=1)] = 24,
-    output: Annotated[Path, typer.Option(help="Folder for tables and figures.", file_okay=False)] = (
-        Path("results/paper")
-    ),
+    out: Annotated[Path, typer.Option(help="Folder for tables and figures.", file_okay=False)] = Path("results/paper"),
 ) -> None:
     """The paper's study: the main job for all three tasks, by the published recipe, on one page.
 
     Takes some minutes. What is done is kept: the same command again goes on where it was interrupted.
     """
-    from mpcoffline.studies import reproduce as reproduce_study
+    with working("Loading"):
+        from mpcoffline.studies import reproduce as reproduce_study
 
-    for result in reproduce_study(output, alpha=alpha, seed=seed, n_episodes=episodes):
+    for result in reproduce_study(out, alpha=alpha, seed=seed, n_episodes=episodes):
         console.print(result.table())
-        say_file("Figure", output / result.task / "figure.png")
-    say_file("All of it", output / "results.md")
+        say_file("Figure", out / result.task / "figure.png")
+    say_file("All of it", out / "results.md")
 
 
 @app.command(
@@ -99,8 +105,10 @@ def reproduce(
 def collect(
     task: TaskArgument,
     alpha: PlantAlpha = None,
-    steps: Annotated[int | None, typer.Option(help="Transitions.", show_default="50000", min=1)] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of agent and environment.", show_default="0", min=0)] = None,
+    steps: Annotated[int | None, typer.Option(help="Transitions.", show_default="the task's, 50000", min=1)] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of agent and environment.", show_default="the task's, 0", min=0)
+    ] = None,
     dataset_id: Annotated[
         str | None, typer.Option(help="Minari id of the new data set.", show_default="says what differs")
     ] = None,
@@ -110,7 +118,8 @@ def collect(
 
     Takes some minutes on one CPU core.
     """
-    from mpcoffline.gallery.collection import collect as collect_data, return_curve
+    with working("Loading"):
+        from mpcoffline.gallery.collection import collect as collect_data, return_curve
 
     dataset = collect_data(
         task, alpha=alpha, steps=steps, seed=seed, dataset_id=dataset_id, overwrite=overwrite, progress=True

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.text import Text
 
-from mpcoffline.core.errors import visible
-
-from .common import Controller, Json, Seed, check_out, examples, loaded_policy, messages, print_json, say
+from .common import check_out, examples, loaded_policy, message, print_json, say
+from .options import Controller, Json, Seed
 
 if TYPE_CHECKING:
     from mpcoffline.control.policy import MPCPolicy
@@ -82,7 +80,7 @@ def serve(
 
     safe = _numbers(pairs("--fallback", fallback))
     if log is not None:
-        check_out("--log", log)
+        check_out("--log", log, make=False)
     from contextlib import ExitStack
 
     from mpcoffline.control.serving import DecisionLog, LineDevice, Service, SystemClock
@@ -106,12 +104,12 @@ def serve(
             transfer=transfer,
             clock=clock,
             log=decisions,
-            tell=lambda text: messages.print(Text(visible(text))),
+            tell=message,
         )
         try:
             service.run(periods)
         except KeyboardInterrupt:
-            messages.print("Ended; the fall-back input was sent last." if safe else "Ended; the inputs stay.")
+            message("Ended; the fall-back input was sent last." if safe else "Ended; the inputs stay.")
     stats = service.stats
     if as_json:
         print_json({"policy": policy, "log": log} | vars(stats))

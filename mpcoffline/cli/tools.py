@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from .common import Controller, Json, examples, loaded_policy, print_json, say, say_file
+from .common import examples, loaded_policy, print_json, say, say_file, working
+from .options import Controller, Json
 
 app = typer.Typer()
 
@@ -27,9 +28,12 @@ def export(
     The folder receives the controller, a header with names and units of the parameters, a CMake file, and a test that
     compares it with this package's solutions.
     """
-    from mpcoffline.control.export import export_c
+    controller = loaded_policy(policy)
+    with working("Writing C"):
+        from mpcoffline.control.export import export_c
 
-    for path in export_c(loaded_policy(policy), out):
+        paths = export_c(controller, out)
+    for path in paths:
         say_file("C", path)
 
 
@@ -73,9 +77,10 @@ def doctor(as_json: Json = False) -> None:
 
     Exit code 1 if something that is needed is broken.
     """
-    from .doctor import checkup
+    with working("Looking at versions, compiler, solvers and data"):
+        from .doctor import checkup
 
-    found = checkup()
+        found = checkup()
     if as_json:
         print_json(found)
     else:

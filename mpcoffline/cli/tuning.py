@@ -10,7 +10,8 @@ from rich.text import Text
 
 from mpcoffline.core.errors import visible
 
-from .common import Json, Preset, Seed, console, examples, messages, print_json
+from .common import console, examples, message, print_json, say_prose, working
+from .options import Json, Preset, Seed
 from .own_plants import (
     Columns,
     Episode,
@@ -76,11 +77,12 @@ def tune(
     """
     options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
     _tell(f"Reading {', '.join(log.name for log in logs)}")
-    from mpcoffline.plants import load_plant
-    from mpcoffline.tune import tune as tuned
+    with working("Reading"):
+        from mpcoffline.plants import load_plant
+        from mpcoffline.tune import tune as tuned
 
-    plant = load_plant(file)
-    table = plant.read(logs, **options)
+        plant = load_plant(file)
+        table = plant.read(logs, **options)
     _tell(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
     try:
         result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=_tell)
@@ -123,13 +125,13 @@ def retune(
     if not as_json:
         far = result.calibration is not None and result.calibration.far
         head, *rest = trial_lines(result.tuned.document)
-        console.print(Text(visible(head), style="bold red" if far else "bold"), soft_wrap=True)
-        console.print(Text(visible("\n".join(rest)) + "\n"), soft_wrap=True)
+        say_prose(Text(visible(head), style="bold red" if far else "bold"))
+        say_prose("\n".join(rest) + "\n")
     _show(result.tuned, as_json)
 
 
 def _tell(text: str) -> None:
-    messages.print(Text(visible(text), style="dim" if text.startswith("Reading") else ""))
+    message(Text(visible(text), style="dim" if text.startswith("Reading") else ""))
 
 
 def _show(result: Tuned, as_json: bool) -> None:

@@ -53,15 +53,17 @@ class Evaluation:
     Attributes:
         cost: Undiscounted cost J = sum of L, ``(n,)``.
         discounted_cost: Jd = sum of gamma^k L, ``(n,)``.
-        success: The environment's ``info["is_success"]`` after the last step, ``(n,)``.
+        success: The environment's ``info["is_success"]`` after the last step, ``(n,)``; False where it says nothing.
         length: Steps, ``(n,)``.
         discount: gamma of ``discounted_cost``.
         states: ``info["state"]`` along each episode, ``(T + 1, nx)``; the observation where the environment does not
             give one at each step.
         actions: Actions applied, ``(T, nu)``.
+        observations: What the policy saw, ``(T + 1, ny)`` of an environment whose observations are arrays.
         n_solves: MPCs that the policy solved meanwhile; 0 for what is no MPC.
         n_failures: Of them, those whose solution was not accepted at first; ``solver_stats`` of the policy says how
             they were answered.
+        knows_success: Whether the environment says if an episode ended well.
     """
 
     cost: Array
@@ -71,14 +73,17 @@ class Evaluation:
     discount: float
     states: list[Array] = field(repr=False)
     actions: list[Array] = field(repr=False)
+    observations: list[Any] = field(repr=False, default_factory=list)
     n_solves: int = 0
     n_failures: int = 0
+    knows_success: bool = True
 
     def __str__(self) -> str:
+        success = f", success {self.success.mean():.0%}" if self.knows_success else ""
         failed = f", failed solves {failures_in_words(self.n_failures, self.n_solves)}" if self.n_solves else ""
         return (
             f"{len(self.cost)} episodes: cost {self.cost.mean():.1f} +- {self.cost.std():.1f}, "
-            f"discounted {self.discounted_cost.mean():.2f}, success {self.success.mean():.0%}{failed}"
+            f"discounted {self.discounted_cost.mean():.2f}{success}{failed}"
         )
 
 
@@ -190,6 +195,8 @@ def _figures(episodes: Sequence[_Episode], rule: PlantInfo, discount: float) -> 
         discount=discount,
         states=[np.array(episode.states if rule.has_state else episode.observations) for episode in episodes],
         actions=[np.array(episode.actions) for episode in episodes],
+        observations=[np.array(episode.observations) for episode in episodes],
+        knows_success=any(episode.knows_success for episode in episodes),
     )
 
 
@@ -202,12 +209,13 @@ def _evaluate_as_arrays(
     observations, info = env.reset(seed=seed, options=list(options))  # type: ignore[arg-type]  # our twin takes a list
     state: Any = None
     first, done = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
-    states, actions, costs = [info["state"]], [], []
+    states, actions, costs, seen = [info["state"]], [], [], [observations]
     while not done.all():
         action, state = policy.predict(observations, state=state, episode_start=first, deterministic=True)
         observations, _, _, done, info = env.step(action)
         first = np.zeros(n, dtype=bool)
         states.append(info["state"])
+        seen.append(observations)
         actions.append(np.asarray(action, dtype=np.float64))
         costs.append(info["cost"])
         if len(costs) >= cap and not done.all():
@@ -221,6 +229,7 @@ def _evaluate_as_arrays(
         discount=discount,
         states=list(np.stack(states, axis=1)),
         actions=list(np.stack(actions, axis=1)),
+        observations=list(np.stack(seen, axis=1)),
     )
 
 
@@ -263,7 +272,7 @@ class _Episode:
     ) -> None:
         self._watch, self._rule, self._number, self._unchanged = watch, rule, number, unchanged
         self.observation, info = watch.env.reset(seed=seed, options=options or None)
-        self.success = self.done = False
+        self.success = self.done = self.knows_success = False
         self.observations: list[Any] = [np.array(self.observation)]
         self._first = rule.state(info, reset=True)
         self._states: list[Array | None] = []
@@ -298,6 +307,7 @@ class _Episode:
         self.actions.append(np.asarray(action, dtype=np.float64))
         self.done = bool(terminated or truncated)
         self.success = bool(number_of(info.get("is_success")) or False)
+        self.knows_success |= "is_success" in info
         if not self.done:  # a policy goes on seeing the last state before the end, which it can solve for
             self.observation = observation
             if len(self.actions) >= cap:

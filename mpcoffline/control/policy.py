@@ -14,10 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, holds, plain, read_archive, write_archive
+from mpcoffline.core.archive import (
+    box_from_json,
+    box_to_json,
+    file_errors,
+    holds,
+    plain,
+    read_archive,
+    with_ending,
+    write_archive,
+)
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.shown import html_of_mpc
 from mpcoffline.solvers import SOLVERS, Plan, Solver, changed_options, check_solver, make_solver
 from mpcoffline.solvers.fallback import Fallback, SolverStats
 from mpcoffline.solvers.options import OF_THE_MACHINE
@@ -120,6 +130,14 @@ class MPCPolicy(BasePolicy):
         self._solver = made
         self._vec_normalize: VecNormalize | None = None
         self._clipping_reported = False
+
+    def extra_repr(self) -> str:
+        """What it sees and sets, and how it is solved."""
+        sees, sets = (", ".join(map(str, each)) for each in (self.mpc.layout.y_labels, self.mpc.layout.u_labels))
+        return f"{sees} -> {sets}; horizon {self.mpc.horizon} of {self.mpc.model.dt:g} s, solver {self.solver_name!r}"
+
+    def _repr_html_(self) -> str:
+        return html_of_mpc(self.mpc)
 
     @property
     def solver_stats(self) -> SolverStats:
@@ -341,7 +359,7 @@ class MPCPolicy(BasePolicy):
         """Reads what :meth:`save` wrote; of a learner's file, the policy that it has learned.
 
         Args:
-            path: The file of a policy or a learner.
+            path: The file of a policy or a learner, with or without ``.zip``.
             device: Accepted for SB3; MPCs are solved on the CPU.
             **solver_options: Options of the solver that go before the file's, e.g. ``n_threads=4``.
 
@@ -350,6 +368,7 @@ class MPCPolicy(BasePolicy):
             InvalidArgumentError: For an option that the solver has not.
             MPCOfflineError: For a learner that has not learned.
         """
+        path = with_ending(path)
         if holds(path, "learner"):
             return cls._of_learner(path, solver_options)
         document, _ = read_archive(path, "policy")

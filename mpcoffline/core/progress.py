@@ -12,6 +12,7 @@ class Bars:
         >>> with Bars() as bars:
         ...     for k in range(1000):
         ...         bars.show("counting", k + 1, 1000, f"at {k}")
+        ...     bars.busy("adding up")
 
     Args:
         shown: Whether to draw any; without, nothing is printed.
@@ -25,24 +26,34 @@ class Bars:
             MofNCompleteColumn,
             Progress,
             ProgressColumn,
+            Task,
             TaskID,
             TextColumn,
             TimeRemainingColumn,
             TransferSpeedColumn,
         )
         from rich.table import Column
+        from rich.text import Text
 
-        bytes_, steps = (DownloadColumn, TransferSpeedColumn), (MofNCompleteColumn, TimeRemainingColumn)
+        class Counts(MofNCompleteColumn):
+            """Nothing where nothing is counted."""
+
+            def render(self, task: Task) -> Text:
+                return Text() if task.total is None else super().render(task)
+
+        bytes_, steps = (DownloadColumn, TransferSpeedColumn), (Counts, TimeRemainingColumn)
         counts: list[ProgressColumn] = [column() for column in (bytes_ if of_bytes else steps)]
         text = TextColumn("{task.description}", markup=False, table_column=Column())  # which wraps: the counts are seen
         self._bars = Progress(text, BarColumn(bar_width=20), *counts, disable=not shown)
         self._tasks: dict[str, TaskID] = {}
+        self._busy: TaskID | None = None
 
     def __enter__(self) -> Self:
         self._bars.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._rest()
         if not self._bars.disable:  # rich before 14.3 prints an empty line even so
             self._bars.stop()
 
@@ -55,10 +66,25 @@ class Bars:
             total: How much there is.
             text: What to say beside the name.
         """
+        self._rest()
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(name)
         description = f"{name}: {text}" if text else name
         self._bars.update(self._tasks[name], completed=done, total=total, description=description)
+
+    def busy(self, name: str) -> None:
+        """A bar that moves without count, until something else is shown: for what takes seconds and has no steps.
+
+        Args:
+            name: What is done.
+        """
+        self._rest()
+        self._busy = self._bars.add_task(name, total=None)
+
+    def _rest(self) -> None:
+        if self._busy is not None:
+            self._bars.remove_task(self._busy)
+            self._busy = None
 
     def advance(self, name: str, by: int) -> None:
         """Moves the bar of a name that :meth:`show` has added."""

@@ -51,16 +51,18 @@ class Table:
         return f"<tr>{''.join(inner)}</tr>"
 
     def __rich__(self) -> RenderableType:
+        from rich.console import Group
         from rich.table import Table as RichTable
         from rich.text import Text
 
-        table = RichTable(box=None, pad_edge=False, show_header=bool(self.header), title_justify="left")
-        table.title = Text(visible(self.title)) if self.title else None
+        table = RichTable(box=None, pad_edge=False, show_header=bool(self.header))
         for k, name in enumerate(self.header):
             table.add_column(Text(visible(name)), justify="right" if self._is_right(k) else "left")
         for k, row in enumerate(self.rows):
             table.add_row(*(Text(visible(cell)) for cell in row), style=self.styles[k] if self.styles else None)
-        return table
+        if not self.title:
+            return table
+        return Group(Text(visible(self.title), style="italic"), table)  # beside it: a table's own is as narrow as it
 
     @property
     def lines(self) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mpcoffline.core.types import Array
 from mpcoffline.plotting import STYLES, controller_label, inline_svg, line_of, new_figure, paper_style
+from mpcoffline.plotting.style import time_unit
 
 from . import figure
 from .background import Background
@@ -113,7 +114,8 @@ class _Panel:
     def __call__(self, axes: Axes) -> None:
         n = len(self.logged)
         step = max(1, n // _MOST_POINTS)
-        times = self.dt * np.arange(n)[::step]
+        unit, name_of_unit = time_unit(self.dt * n)
+        times = self.dt / unit * np.arange(n)[::step]
         shape: Literal["post"] | None = "post" if self.held else None
         drawn = "steps-post" if self.held else "default"
         for k, (name, values) in enumerate(self.curves.items()):
@@ -126,7 +128,7 @@ class _Panel:
                 times, self.logged[::step], ":", drawstyle=drawn, color=_TODAY, linewidth=1.2, label="today (log)"
             )
         axes.set_title(self.name if self.name.startswith("$") else self.name.replace("$", r"\$"), loc="left")
-        axes.set_xlabel("time [s]")
+        axes.set_xlabel(f"time [{name_of_unit}]")
         axes.margins(x=0.0)
 
 

@@ -33,7 +33,7 @@ from .verdict import Judgement, Verdict, costs_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WIDTH = 84  # of the text
+_WIDTH = 79  # of the text
 
 
 @dataclass(frozen=True)

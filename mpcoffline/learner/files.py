@@ -5,7 +5,7 @@ from __future__ import annotations
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, write_archive
+from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, with_ending, write_archive
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.text import check_name
 from mpcoffline.learning import METHODS, FitResult, ValueFunction
@@ -50,6 +50,7 @@ def write_learner(learner: OfflineMPCLearner, path: str | PathLike[str]) -> None
 
 def read_learner(cls: type[OfflineMPCLearner], path: str | PathLike[str]) -> OfflineMPCLearner:
     """See :meth:`OfflineMPCLearner.load`."""
+    path = with_ending(path)
     document, arrays = read_archive(path, "learner")
     method = METHODS.of_file(document.get("method"), str(path))
     with file_errors(path):

@@ -279,6 +279,7 @@ class OfflineMPCLearner:
             check_search()
         for name in evaluators or {}:
             check_name("evaluator", name)
+        check_callbacks(callbacks)
         check_also(self.nominal_mpc, also or {})
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
@@ -298,7 +299,7 @@ class OfflineMPCLearner:
             for callback in callbacks:
                 if (end := getattr(callback, "on_fit_end", None)) is not None:
                     ending.callback(end)
-            for epoch in run.epochs(n_steps_per_epoch):
+            for epoch in run.epochs(n_steps_per_epoch, bars.busy):
                 self.value_function, self.result = run.value_function, run.result
                 self._mpc, self._policy, self._observation_space = self._ready(run), None, observation_space
                 metrics = dict(epoch.metrics)
@@ -315,6 +316,7 @@ class OfflineMPCLearner:
                 if any(_asks_to_end(answer) for answer in answers):
                     break
             if run.learned is not None:
+                bars.busy("models of the log")
                 kept = None if saved is None else saved.kept
                 self.candidates = candidates_of(self, run, table, bars, also or {}, kept, core_seconds() - begun)
                 self._policy = None
@@ -388,6 +390,19 @@ class OfflineMPCLearner:
                 known here.
         """
         return read_learner(cls, path)
+
+
+def check_callbacks(callbacks: Sequence[object]) -> None:
+    """Refuses what cannot be called, before anything is learned.
+
+    Raises:
+        InvalidArgumentError: For one that is no function; SB3's are told how they become one.
+    """
+    for callback in callbacks:
+        if not callable(callback):
+            hint = "One of Stable-Baselines3's goes in as mpcoffline.sb3.SB3Callback(callback)."
+            expected = "functions (learner, epoch, total_step)"
+            raise InvalidArgumentError("callbacks", expected=expected, actual=repr(callback)[:200], hint=hint)
 
 
 def _asks_to_end(answer: Any) -> bool:

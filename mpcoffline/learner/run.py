@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.text import listed
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
 from mpcoffline.learning.ends import innermost
@@ -69,20 +70,23 @@ class Run:
         self._trainings: dict[str, Training] = {}
         self._restored: dict[str, Arrays] = {}
 
-    def epochs(self, n_steps: int | None = None) -> Iterator[Epoch]:
+    def epochs(self, n_steps: int | None = None, tell: Callable[[str], None] = lambda _: None) -> Iterator[Epoch]:
         """Runs the stages; yields at the end of each epoch.
 
         Args:
             n_steps: Steps in an epoch; by default what each stage says.
+            tell: Is told the name of what begins now and has no epochs.
 
         Raises:
             InvalidDataError: If the data do not fit.
             MPCOfflineError: If a regression fails.
         """
+        tell("looking at the data")
         known = self._prepared()
         stages, total = list(self.method.stages().items()), 0
         while stages:
             (name, stage), *stages = stages
+            tell(name)
             if not isinstance(stage, Stage):
                 known = stage(known)
                 continue
@@ -97,7 +101,9 @@ class Run:
                 metrics = training.advance(n_steps or stage.epoch)
                 if len(changes) == len(stages):  # the last stage with steps; what is found once holds until the next
                     self._outcome = functools.cache(functools.partial(_ended, known, stage, training, changes))
-                    self.result = self._outcome().result if training.done else None
+                    if _is_done(training):
+                        tell(listed([later for later, _ in stages]) or name)
+                        self.result = self._outcome().result
                 yield Epoch(stage.phase, training.step, training.n_steps, total + training.step, metrics)
             if self._outcome is not None:
                 return
@@ -160,6 +166,10 @@ class Run:
         for key, array in arrays.items():
             name, _, own = key.partition("/")
             self._restored.setdefault(name, {})[own] = array
+
+
+def _is_done(training: Training) -> bool:
+    return training.done
 
 
 def _ended(known: Known, stage: Stage, training: Training, changes: list[Change]) -> Known:

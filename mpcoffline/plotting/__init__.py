@@ -7,7 +7,7 @@ A learner's: :func:`training_figure`, :func:`cost_figure`, :func:`loop_figure`, 
 from __future__ import annotations
 
 from .animation import animate, check_film
-from .costs import cost_figure, draw_weights, stage_weights
+from .costs import cost_figure, draw_weights, stage_weights, weights_figure
 from .loops import loop_figure
 from .portrait import phase_portrait
 from .signals import Signal, draw_bars, draw_signal
@@ -51,4 +51,5 @@ __all__ = [
     "save_figure",
     "stage_weights",
     "training_figure",
+    "weights_figure",
 ]

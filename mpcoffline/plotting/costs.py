@@ -76,6 +76,27 @@ def cost_figure(
     return figure
 
 
+def weights_figure(nominal: MPC, learned: MPC, names: tuple[str, str] = ("MPC_1", "MPC_3")) -> Figure:
+    """Draws the weights of two MPCs' stage costs, of any plant, as :func:`cost_figure` does for the tasks.
+
+    Args:
+        nominal: The MPC before learning.
+        learned: The MPC after it.
+        names: How they are called.
+
+    Returns:
+        The figure; :func:`save_figure` writes it.
+    """
+    with paper_style():
+        figure = new_figure(PAGE_WIDTH, 2.9)
+        for axes, name, mpc in zip(np.asarray(figure.subplots(1, 2)), names, (nominal, learned), strict=True):
+            entries = [each.name for each in (*mpc.layout.y_labels, *mpc.layout.u_labels)]
+            draw_weights(axes, stage_weights(mpc), entries)
+            axes.tick_params(axis="x", rotation=45)
+            axes.set_title(f"weights of {controller_label(name)}")
+    return figure
+
+
 def stage_weights(mpc: MPC) -> Array:
     """Half the Hessian of the stage cost in observation and input at the reference, ``(ny + nu, ny + nu)``.
 

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 _LEVELS = 14  # about
 _EXTREME = 99.5  # percentile of V at which its shades end
+_START: dict[str, Any] = {
+    "marker": "o", "color": "white", "markeredgecolor": "black", "markersize": 4.5, "markeredgewidth": 0.8,
+}  # fmt: skip
+_TARGET = _START | {"marker": "*", "markersize": 10, "markeredgewidth": 0.7}
 _MARGIN = 0.04  # around trajectories that leave the plane, as a share of it
 
 
@@ -49,6 +53,8 @@ def phase_portrait(
     Raises:
         InvalidArgumentError: For an environment that is none of this package's tasks.
     """
+    from matplotlib.lines import Line2D
+
     task, plant = task_of(env)
     plane = _around(plane_of(plant), loops)
     landscape = on_plane(task, plane, value)
@@ -63,6 +69,8 @@ def phase_portrait(
         _mark_target(axes, plane)
         label_plane(axes, plane)
         handles, names = legend_handles(list(loops))
+        marks = [Line2D([], [], linestyle="", **_START), Line2D([], [], linestyle="", **_TARGET)]
+        handles, names = [*handles, *marks], [*names, "start", "target"]
         figure.legend(handles, names, loc="outside upper center", ncols=len(names), handlelength=3.2)
     return figure
 
@@ -130,13 +138,13 @@ def _draw_trajectory(axes: Axes, states: Array, plane: Plane, name: str) -> None
 
     x, y = _projected(states, plane)
     style = STYLES.get(name, OTHER)
-    halo = [Stroke(linewidth=style.width + 1.4, foreground="white"), Normal()]
+    halo = [Stroke(linewidth=style.width + 2.2, foreground="white"), Normal()]
     axes.plot(x, y, **line_of(style), path_effects=halo, zorder=3)
-    axes.plot(x[0], y[0], "o", color="white", markeredgecolor="black", markersize=4.5, markeredgewidth=0.8, zorder=4)
+    axes.plot(x[0], y[0], **_START, zorder=4)
 
 
 def _mark_target(axes: Axes, plane: Plane) -> None:
     horizontal = plane[0]
     places = [np.pi * k for k in half_turns(horizontal) if k % 2 == 0] if horizontal.angle else [0.0]
     for place in places:
-        axes.plot(place, 0.0, "*", color="white", markeredgecolor="black", markersize=10, markeredgewidth=0.7, zorder=5)
+        axes.plot(place, 0.0, **_TARGET, zorder=5)

@@ -12,7 +12,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.envs import Plant
 
 from .panels import in_pi, unwrapped
-from .style import BOUND, OTHER, STYLES, controller_label, line_of
+from .style import BOUND, COURSE, OTHER, STYLES, controller_label, line_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,6 +30,8 @@ class Signal:
         held: Whether it is constant between samples (an input).
         angle: Whether it is an angle in rad; it is drawn without jumps, with the target at every full turn.
         band: Half-width around the target that counts as success; shaded.
+        course: What the quantity should follow, step by step, or itself where no controller moves it; a thin line.
+        limits: Values that it should not pass; dashed lines.
     """
 
     label: str
@@ -39,6 +41,8 @@ class Signal:
     held: bool = False
     angle: bool = False
     band: float | None = None
+    course: Array | None = None
+    limits: tuple[float, ...] = ()
 
 
 def signals_of(plant: Plant, states: Mapping[str, Array], actions: Mapping[str, Array]) -> list[Signal]:
@@ -70,6 +74,11 @@ def draw_signal(axes: Axes, signal: Signal, dt: float) -> None:
     """
     if signal.target is not None and not signal.angle:
         _draw_target(axes, signal.target, signal.band)
+    for limit in signal.limits:
+        axes.axhline(limit, color=BOUND, linewidth=0.9, linestyle=(0, (2, 1.5)), zorder=2)
+    if signal.course is not None:
+        times = dt * np.arange(len(signal.course), dtype=np.float64)
+        axes.plot(times, signal.course, drawstyle="steps-post", color=COURSE, linewidth=0.9, zorder=2)
     for name, values in signal.values.items():
         style = STYLES.get(name, OTHER)
         times = dt * np.arange(len(values), dtype=np.float64)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 COLUMN_WIDTH = 3.5
 PAGE_WIDTH = 7.16
 _PNG_DPI = 200
+_TIMES = ((1.0, "s", 600.0), (60.0, "min", 6 * 3600.0), (3600.0, "h", float("inf")))  # and to which length each
 _INDEXED = re.compile(r"([A-Za-z]+)_(\d+)")
 
 
@@ -43,8 +44,14 @@ STYLES: dict[str, LineStyle] = {
     "MPC_3": LineStyle("#0072B2", "-", 1.7),
     "reference": LineStyle("#000000", (0, (1, 1.2)), 1.2),
 }
+#: What is no controller.
+OTHERS: dict[str, LineStyle] = {
+    "set-point, disturbance": LineStyle("#000000", "-", 0.9),
+    "limit": LineStyle("#767676", (0, (2, 1.5)), 0.9),
+}
 OTHER = LineStyle("#CC79A7", (0, (1, 1)))
 BOUND = "#767676"
+COURSE = "#000000"  # of set-points and what else comes from outside
 
 
 @contextmanager
@@ -127,11 +134,16 @@ def controller_label(name: str) -> str:
 
 
 def legend_handles(names: Sequence[str]) -> tuple[list[Any], list[str]]:
-    """Handles and labels of a legend for controllers."""
+    """Handles and labels of a legend for controllers, and for what else there are styles of."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], **line_of(STYLES.get(name, OTHER))) for name in names]
+    handles = [Line2D([], [], **line_of((STYLES | OTHERS).get(name, OTHER))) for name in names]
     return handles, [controller_label(name) for name in names]
+
+
+def time_unit(seconds: float) -> tuple[float, str]:
+    """In which unit a stretch of time is drawn: how many seconds it has, and its name."""
+    return next((unit, name) for unit, name, most in _TIMES if seconds <= most)
 
 
 def line_of(style: LineStyle) -> dict[str, Any]:

@@ -22,6 +22,7 @@ _TITLES = {
     "fit_loss": "(FIT): loss of $\\theta$",
 }
 _DECADE = 10.0
+_BEFORE_AND_AFTER = 2
 
 
 def training_figure(learner: OfflineMPCLearner) -> Figure:
@@ -39,17 +40,43 @@ def training_figure(learner: OfflineMPCLearner) -> Figure:
     if not learner.history:
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
     metrics = list(dict.fromkeys(name for _, entry in learner.history for name in entry))
+    given = "value_loss" not in metrics and learner.value_function is not None
     with paper_style():
-        figure = new_figure(PAGE_WIDTH * min(1.0, 0.4 * len(metrics) + 0.15), 2.3)
-        for axes, name in zip(np.atleast_1d(figure.subplots(1, len(metrics))), metrics, strict=True):
+        figure = new_figure(PAGE_WIDTH * min(1.0, 0.4 * (len(metrics) + given) + 0.15), 2.3)
+        panels = list(np.atleast_1d(figure.subplots(1, len(metrics) + given)))
+        if given:
+            _say(
+                panels.pop(0),
+                "value_loss",
+                "V was given to this fit:\nits curve is that of the fit\nthat has learned it",
+            )
+        for axes, name in zip(panels, metrics, strict=True):
             epochs = [epoch for epoch, entry in learner.history if name in entry]
             values = [entry[name] for _, entry in learner.history if name in entry]
             if name == "fit_loss" and learner.result is not None:
                 epochs, values = [epochs[0] - 1, *epochs], [learner.result.loss_before, *values]
-            _draw_curve(axes, np.array(epochs), np.array(values))
+            if name == "fit_loss" and len(values) == _BEFORE_AND_AFTER:
+                _draw_pair(axes, np.array(values))
+            else:
+                _draw_curve(axes, np.array(epochs), np.array(values))
             ends = f", {values[0]:.3g} to {values[-1]:.3g}" if len(values) > 1 else ""
             axes.set_title(_TITLES.get(name, name.replace("_", " ")) + ends)
+            axes.set_ylabel(name.replace("_", " "))
     return figure
+
+
+def _say(axes: Axes, name: str, text: str) -> None:
+    axes.set_title(_TITLES[name])
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+    axes.set_axis_off()
+
+
+def _draw_pair(axes: Axes, values: Array) -> None:
+    """A regression that is solved in one go: its error before and after."""
+    axes.bar([0, 1], values, 0.5, color=[STYLES["MPC_1"].color, STYLES["MPC_3"].color])
+    axes.set_xticks([0, 1], ["MPC_1", "learned"])
+    axes.set_xlim(-0.6, 1.6)
+    axes.grid(visible=False, axis="x")
 
 
 def _draw_curve(axes: Axes, epochs: Array, values: Array) -> None:

@@ -77,6 +77,10 @@ class MPCModel(BaseAlgorithm):
         if seed is not None:
             self.policy.set_random_seed(seed)
 
+    def __repr__(self) -> str:
+        """The policy, and how many environments it acts in."""
+        return f"{type(self).__name__}({self.policy!r}, {self.n_envs if self.env is not None else 'no'} environments)"
+
     def _setup_model(self) -> None:
         """There is nothing to set up: the policy is given."""
 
@@ -204,9 +208,7 @@ class MPCModel(BaseAlgorithm):
         """
         if print_system_info:
             get_system_info()
-        file = Path(path)
-        policy = MPCPolicy.load(file if file.exists() else _with_suffix(file))
-        return cls(policy, env, verbose=verbose, seed=seed)
+        return cls(MPCPolicy.load(path), env, verbose=verbose, seed=seed)
 
 
 def _with_suffix(path: Path) -> Path:

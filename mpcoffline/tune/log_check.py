@@ -11,6 +11,7 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.tables import Table
+from mpcoffline.core.text import figure
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -179,7 +180,7 @@ def _sampling(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -
     taus = np.sort(time_constants(mpc.with_theta(identified.theta), rows.observations, rows.actions))
     if not len(taus):
         return
-    listed = ", ".join(f"{tau:.3g}" for tau in taus)
+    listed = ", ".join(figure(float(tau)) for tau in taus)
     text = f"time constants about {listed} s, control interval {plant.dt:g} s"
     if plant.dt > _COARSE * taus[-1]:
         found.add("advice", "sampling", f"{text}: the plant settles between two decisions; decide more often")

@@ -24,7 +24,7 @@ from mpcoffline.simulation.choice import FIRST
 from .folder import LEARNER, LOG, PAGE, POLICY, RUN, read_run
 from .making import KEEP, RUNNING
 
-_WIDTH = 84
+_WIDTH = 79
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ HOSTILE = "\x1b]0;title\x07\x1b[2J\u202e <b>_x_</b>"
         ["learn", "pendulum", "--out", "{folder}/x.zip", "--checkpoint", "{taken}"],
         ["learn", "pendulum", "--out", "{folder}/x.zip", "--log-csv", "{taken}"],
         ["learn", "pendulum", "--out", "{folder}/x.zip", "--tensorboard", "{folder}/file/events"],
-        ["run", "pendulum", "--output", "{folder}/file/results"],
-        ["reproduce", "--output", "{folder}/file/results"],
+        ["run", "pendulum", "--out", "{folder}/file/results"],
+        ["reproduce", "--out", "{folder}/file/results"],
         ["datasets", "show", "mpcoffline/pendulum/ddpg-v0", "--figure", "{folder}/file/x.png"],
     ],
 )

@@ -37,3 +37,10 @@ def test_bars_that_are_not_wanted_print_nothing(capsys: pytest.CaptureFixture[st
         bars.show("work", 1, 2)
         bars.advance("work", 1)
     assert capsys.readouterr() == ("", "")
+
+
+def test_what_has_no_steps_is_shown_until_something_else_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with Bars() as bars:
+        bars.busy("terminal cost")
+        bars.show("choosing", 1, 2)
+    assert capsys.readouterr().out.split()[0] == "choosing"

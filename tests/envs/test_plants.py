@@ -167,7 +167,7 @@ import gymnasium as gym, matplotlib.figure, numpy as np
 import own_plant
 from gymnasium.envs.registration import EnvSpec
 from mpcoffline import MPCPolicy, evaluate, nominal_mpc, plotting
-from mpcoffline.cli.common import Task
+from mpcoffline.cli.options import Task
 from mpcoffline.envs import PLANTS
 from mpcoffline.studies.references import best_known_costs
 

@@ -123,7 +123,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "half a Parquet file": (b"", "log.csv: expected a table, got parquet: File out of specification"),
     "a header of ten thousand columns": (
         ",".join(["time", *(f"c{i}" for i in range(10_000))]) + "\n" + "\n".join(["1" + ",1" * 10_000] * 3),
-        "column of 'h1': expected one among 'time', 'c0', .* and 9971 more, got none",
+        "columns of 'h1', 'h2', 'pump', 'set_point': expected one among 'time', 'c0', .* and 9971 more, got none",
     ),
     "one line of 20 MB": (b"a" * 20_000_000, "log.csv: expected a table of numbers, got no row of one"),
 }

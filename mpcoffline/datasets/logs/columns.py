@@ -61,6 +61,10 @@ class Found(NamedTuple):
     said: str
 
 
+class MissingColumnError(InvalidDataError):
+    """A log has no column of a name."""
+
+
 def _plain(text: str) -> str:
     return re.sub(r"[\W_]+", "", text.casefold())
 
@@ -100,7 +104,7 @@ def place_of(source: Source, name: str, given: str | None) -> tuple[int, str | N
         raise InvalidDataError(where, expected="one column of that name", actual=f"{len(chosen)}: {actual}", hint=hint)
     near = difflib.get_close_matches(wanted, source.header, n=1, cutoff=0.4)
     hint = f"Is it {near[0][:_SHOWN]!r}? " if near else ""
-    raise InvalidDataError(
+    raise MissingColumnError(
         where,
         expected=f"one among {listed}",
         actual="none",
@@ -122,8 +126,9 @@ def found(
         if other := [name for name in given if name not in known]:
             raise InvalidArgumentError(argument, expected=f"names among {', '.join(known)}", actual=repr(other[0]))
     result: dict[str, Found] = {}
+    places = _places(source, known, columns)
     for each in quantities:
-        place, unit = place_of(source, each.name, columns.get(each.name))
+        place, unit = places[each.name]
         unit, header = units.get(each.name, unit), source.header[place]
         twice = [name for name, other in result.items() if other.place == place]
         if twice:
@@ -134,6 +139,33 @@ def found(
         said = f"{each.name}: {unit} to {each.unit}" if changed else ""
         result[each.name] = Found(place, header, factor, offset, said)
     return result
+
+
+def _places(source: Source, names: Sequence[str], columns: Mapping[str, str]) -> dict[str, tuple[int, str | None]]:
+    """The column of each name and its unit; all names that have none are told at once.
+
+    Raises:
+        InvalidDataError: If some have none, or more than one.
+    """
+    result, missing = {}, {}
+    for name in names:
+        try:
+            result[name] = place_of(source, name, columns.get(name))
+        except MissingColumnError as error:
+            missing[name] = error
+    if not missing:
+        return result
+    first = next(iter(missing.values()))
+    if len(missing) == 1:
+        raise first
+    guesses = [f"{name}: {error.hint.partition('?')[0]}?" for name, error in missing.items() if "?" in error.hint]
+    said = f"{' '.join(guesses)} " if guesses else ""
+    raise MissingColumnError(
+        f"{source.name}: columns of {', '.join(map(repr, missing))}",
+        expected=first.expected,
+        actual="none of them",
+        hint=f"{said}columns={{{next(iter(missing))!r}: ..., ...}} says which (--column {next(iter(missing))}=...).",
+    )
 
 
 @dataclass

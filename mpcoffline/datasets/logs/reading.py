@@ -19,13 +19,15 @@ from . import faults
 from .collecting import Options, Rows, collected
 from .columns import Quantity
 from .report import LogReport
-from .sampling import Series, averaged, between, free_of, grid, held, phase_of
+from .sampling import Series, averaged, between, bridge, free_of, grid, held, phase_of, single_gaps
 from .wanted import Wanted
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
 _SLOW = 1.2  # control intervals, beyond which rows are too far apart
+_HARMLESS = 0.05  # of what a step moves, by which a bridged value may be off
+_OVER_ONE = 2.05  # times the usual time between rows, over one that is missing
 _CLIPPED = 0.01  # of an input's range, by which it may lie beyond its bounds
 _MOST_BEYOND = 0.2  # share of rows
 _UNIT = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
@@ -218,7 +220,9 @@ def _sampled(name: str, rows: Rows, wanted: Wanted, max_gap: float, report: LogR
             f"resampled to {dt:g} s, intervals beginning {where}: states linearly between rows, signals as last known,"
             " inputs their mean over the interval (nothing is filtered)"
         )
-    states = np.stack([between(series.pop(each.name), at, dt, max_gap) for each in wanted.states], axis=1)
+    reaches = [_reach(series[each.name], each, t, max_gap, report) for each in wanted.states]
+    columns = [between(series.pop(q.name), at, dt, reach) for q, reach in zip(wanted.states, reaches, strict=True)]
+    states = np.stack(columns, axis=1)
     inputs, moved = np.empty((len(at), len(wanted.inputs))), 0
     for i, each in enumerate(wanted.inputs):
         inputs[:, i], changed = averaged(series.pop(each.name), at, dt, max_gap)
@@ -265,6 +269,25 @@ def _sampled(name: str, rows: Rows, wanted: Wanted, max_gap: float, report: LogR
     table.names = _names(wanted)
     table.action_bounds = tuple(np.array([getattr(q, end) for q in wanted.inputs]) for end in ("low", "high"))  # type: ignore[assignment]
     return table
+
+
+def _reach(own: Series, each: Quantity, t: Array, max_gap: float, report: LogReport) -> float:
+    """How far apart values of a state may be for what lies between: over single empty cells where that is harmless.
+
+    Harmless is what is off by less than a twentieth of what a step moves: a model that is fitted to steps does not
+    notice. Where the state moves less smoothly than that, the step in front of the cell and the one behind it are lost.
+    """
+    reach = max(max_gap, _OVER_ONE * float(np.median(np.diff(t)))) if len(t) > 1 else max_gap
+    n = int(single_gaps(own, t, max_gap, reach).sum())
+    if not n:
+        return max_gap
+    off, step = bridge(own, reach)
+    harmless = off <= _HARMLESS * step
+    cells = "single empty cell" if n == 1 else "single empty cells"
+    measured = f"a value between its neighbours is off by {off:.2g} {each.unit}".rstrip() + f", a step moves {step:.2g}"
+    what = "bridged" if harmless else "not bridged, a new episode begins behind each"
+    report.note(f"{each.name}: {n} {cells} {what} ({measured})")
+    return reach if harmless else max_gap
 
 
 def _names(wanted: Wanted) -> tuple[str, ...]:

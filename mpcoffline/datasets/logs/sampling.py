@@ -78,6 +78,39 @@ def between(s: Series, at: Array, dt: float, max_gap: float) -> Array:
     return np.where(known & inside, value, np.nan)
 
 
+def single_gaps(s: Series, t: Array, max_gap: float, reach: float) -> NDArray[np.bool_]:
+    """After which values single ones are missing while rows go on, ``(m - 1,)``.
+
+    Args:
+        s: The values that are known.
+        t: The times of all rows.
+        max_gap: Time between rows beyond which there is a gap.
+        reach: Time between two values that one is missing between.
+    """
+    missing = (np.diff(s.t) > max_gap) & (np.diff(s.t) <= reach)
+    rows = np.searchsorted(t, s.t[1:]) - np.searchsorted(t, s.t[:-1])
+    return np.asarray(missing & (rows > 1))
+
+
+def bridge(s: Series, reach: float) -> tuple[float, float]:
+    """How far off a value would be that is taken between its neighbours, and how far a step goes: root mean squares.
+
+    Both are of the log's own values, where all three are known.
+
+    Args:
+        s: The values that are known.
+        reach: How far the neighbours may be apart.
+    """
+    width = s.t[2:] - s.t[:-2]
+    known = width <= reach
+    if not known.any():
+        return np.inf, 0.0
+    share = (s.t[1:-1] - s.t[:-2]) / width
+    off = (s.v[1:-1] - s.v[:-2] - share * (s.v[2:] - s.v[:-2]))[known]
+    step = (s.v[1:-1] - s.v[:-2])[known]
+    return float(np.sqrt(np.mean(off**2))), float(np.sqrt(np.mean(step**2)))
+
+
 def held(s: Series, at: Array, dt: float, max_gap: float) -> Array:
     """The last value before some times; NaN where it is older than a gap."""
     if not len(s.t):
