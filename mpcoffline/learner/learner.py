@@ -13,14 +13,14 @@ import numpy as np
 from gymnasium import spaces
 
 from mpcoffline.control.policy import MPCPolicy
-from mpcoffline.core.checks import check_integers, check_known, check_number
+from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.notebook import html_of
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.consistency import check
-from mpcoffline.learning import METHODS, FitResult, Known, Method, ValueFunction, ValueMethod
+from mpcoffline.learning import FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.shown import parameter_table
 from mpcoffline.simulation.polishing import check_search
@@ -30,7 +30,7 @@ from .checkpoint import Checkpoint, History
 from .effort import core_seconds
 from .files import read_learner, write_learner
 from .findings import findings
-from .presets import PRESETS
+from .presets import method_of
 from .run import Run
 from .softening import Soften, Softening, check_soften, softening_found
 
@@ -136,23 +136,12 @@ class OfflineMPCLearner:
     ) -> None:
         if not isinstance(learn, str) or learn not in _GROUPS:
             raise InvalidArgumentError("learn", expected=" or ".join(map(repr, _GROUPS)), actual=repr(learn))
-        check_known("preset", preset, PRESETS)
-        if method is not None and preset != "default":
-            expected = "none beside a method: a preset names its own"
-            raise InvalidArgumentError("preset", expected=expected, actual=repr(preset))
-        self.preset = preset if method is None else None
-        if method is None:
-            method = PRESETS[preset]
-        elif not isinstance(method, Method):
-            method = METHODS[method]()
-        if value is not None:
-            options["value"] = value
         check_integers(0, seed=seed)
         if value_function is not None and value_function.ny != mpc.nx:
-            raise InvalidArgumentError(
-                "value_function", expected=f"a function of {mpc.nx} coordinates", actual=str(value_function.ny)
-            )
-        self.method = method.replaced(options)
+            expected, actual = f"a function of {mpc.nx} coordinates", str(value_function.ny)
+            raise InvalidArgumentError("value_function", expected=expected, actual=actual)
+        self.preset = preset if method is None else None
+        self.method = method_of(preset, method, options if value is None else options | {"value": value})
         self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
         self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
         if keep_limits is not None:
@@ -180,10 +169,8 @@ class OfflineMPCLearner:
         return f"{type(self).__name__}(learn={self.learn!r}, {how}, seed={self.seed}; {state})"
 
     def _repr_html_(self) -> str:
-        table = parameter_table(self.nominal_mpc)
-        if isinstance(self._mpc, MPC):
-            table = parameter_table(self._mpc, self.nominal_mpc)
-        return html_of(repr(self), tables=[table], sentences=self.findings)
+        shown = (self._mpc, self.nominal_mpc) if isinstance(self._mpc, MPC) else (self.nominal_mpc,)
+        return html_of(repr(self), tables=[parameter_table(*shown)], sentences=self.findings)
 
     def __str__(self) -> str:
         """The same, and what was found beside the parameters."""

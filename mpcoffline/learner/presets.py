@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
-from mpcoffline.learning import Bellman, CostConfig, Method, ParameterConfig, StartConfig, TerminalConfig, ValueConfig
+from mpcoffline.core.checks import check_known
+from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.learning import (
+    METHODS,
+    Bellman,
+    CostConfig,
+    Method,
+    ParameterConfig,
+    StartConfig,
+    TerminalConfig,
+    ValueConfig,
+)
 
 _DEFAULT = Bellman(
     least_discount=0.95,
@@ -32,3 +45,21 @@ PRESETS: dict[str, Method] = {
     # mercy of its errors where it cannot. The larger discount gives V more to bridge, so it learns for longer.
     "best": replace(_DEFAULT, least_horizon=50, least_discount=0.97, value=replace(_DEFAULT.value, n_steps=6_000)),
 }
+
+
+def method_of(preset: str, method: str | Method | None, options: Mapping[str, Any]) -> Method:
+    """The learning method of a preset, or one that is given, with options.
+
+    Raises:
+        UnknownIdError: For an unknown preset, method or option.
+        InvalidArgumentError: For a preset beside a method, or an option out of range.
+    """
+    check_known("preset", preset, PRESETS)
+    if method is not None and preset != "default":
+        expected = "none beside a method: a preset names its own"
+        raise InvalidArgumentError("preset", expected=expected, actual=repr(preset))
+    if method is None:
+        method = PRESETS[preset]
+    elif not isinstance(method, Method):
+        method = METHODS[method]()
+    return method.replaced(options)
