@@ -147,11 +147,8 @@ class MPCPolicy(BasePolicy):
     def retry_at_most(self, share: float) -> None:
         """Limits which share of its problems is tried again from all starts, beyond the first thousand.
 
-        A retry costs some hundred times as much as a warm solve: who compares many MPCs does not wait for one whose
-        solves fail again and again. What is not retried is answered as :attr:`solver_stats` says, by the best plan.
-
-        Raises:
-            InvalidArgumentError: For a share outside 0 to 1.
+        A retry takes as long as some hundred warm solves, too long for one of many MPCs whose solves fail again and
+        again. Raises :class:`InvalidArgumentError` for a share outside 0 to 1.
         """
         check_number("share", share, 0.0, 1.0, open_low=False)
         self._fallback.most_retried = share
