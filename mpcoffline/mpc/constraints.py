@@ -186,19 +186,25 @@ class StateBounds(AnyConstraint):
         high: Upper bounds, ``(nx,)``.
         name: What it is called in a solution's status.
         soft: None for hard bounds, else the price of violating them.
+        at_end: Without it soft bounds hold at k = 0 ... N - 1, as other limits of a stage: where the terminal cost is a
+            value that knows their price at x_N. What x_0 costs is then a part of the MPC's value.
 
     Raises:
-        InvalidArgumentError: For bounds that cross, are NaN or of different shapes, or that no number can keep.
+        InvalidArgumentError: For bounds that cross, are NaN or of different shapes, or that no number can keep; for
+            hard ones without ``at_end``.
     """
 
     low: ArrayLike
     high: ArrayLike
     name: str = "state bounds"
     soft: Penalty | None = None
+    at_end: bool = True
 
     def __post_init__(self) -> None:
         check_name("name of a constraint", self.name)
         object.__setattr__(self, "soft", _checked_penalty(self.name, self.soft))
+        if not self.at_end and self.soft is None:
+            raise InvalidArgumentError(f"{self.name}.at_end", expected="True for hard bounds", actual="False")
         low, high = (np.atleast_1d(np.array(bound, dtype=np.float64)) for bound in (self.low, self.high))
         if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
             raise InvalidArgumentError(self.name, expected="low <= high of one shape", actual=f"{low} and {high}")
@@ -239,14 +245,21 @@ class StateBounds(AnyConstraint):
             "soft": None if self.soft is None else list(self.soft),
             "low": _finite_or_none(np.asarray(self.low)),
             "high": _finite_or_none(np.asarray(self.high)),
+            "at_end": self.at_end,
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any], sizes: Sizes) -> Self:
-        """The inverse of ``to_json``."""
+        """The inverse of ``to_json``.
+
+        Raises:
+            FileFormatError: If the data are damaged.
+        """
+        if not isinstance(at_end := data["at_end"], bool):
+            raise FileFormatError("constraint: at_end", expected="true or false", actual=repr(at_end)[:200])
         low = [-np.inf if v is None else float(v) for v in data["low"]]
         high = [np.inf if v is None else float(v) for v in data["high"]]
-        return cls(low, high, data["name"], _penalty_from_json(data["soft"]))
+        return cls(low, high, data["name"], _penalty_from_json(data["soft"]), at_end)
 
 
 Constraints = ConstraintFunction | AnyConstraint | Sequence[AnyConstraint]
