@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Constraint, Model, Penalty, QuadraticCost, StateBounds
-from mpcoffline.solvers import DDPSolver, IpoptSolver
+from mpcoffline.solvers import DDPSolver, IpoptSolver, Status
 
 Array = NDArray[np.float64]
 N, DISCOUNT = 6, 0.95
@@ -190,9 +190,11 @@ def test_soft_constraints_are_never_infeasible() -> None:
         ),
     ],
 )
-def test_the_violated_constraint_is_named(constraints: Any, named: str) -> None:
-    solution = IpoptSolver(double_integrator(constraints=constraints)).solve([[6.0, 0.0]])
+@pytest.mark.parametrize("solver", [IpoptSolver, DDPSolver])
+def test_the_violated_constraint_is_named(constraints: Any, named: str, solver: Any) -> None:
+    solution = solver(double_integrator(constraints=constraints)).solve([[6.0, 0.0]])
     assert solution.success.tolist() == [False]
+    assert solution.status == [Status.INFEASIBLE]
     assert solution.stats["violation"][0] > 0.1
     with pytest.raises(AssertionError, match=named):
         raise AssertionError(solution.words[0])
