@@ -185,7 +185,9 @@ class Exported:
         command = ["gcc", "-std=c99", "-w", *flags, "-I.", "counting.c", "main.c", "-o", "controller", "-lm"]
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
 
-    def __call__(self, resets: Array, thetas: Array, y: Array, seconds: float) -> tuple[Array, Array, Array]:
+    def __call__(
+        self, resets: Array, thetas: Array, y: Array, seconds: float | None = None
+    ) -> tuple[Array, Array, Array]:
         """Steps one after another: what each returns, its iterations, and the inputs ``(B, nu)``.
 
         Raises:
