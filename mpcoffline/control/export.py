@@ -247,8 +247,9 @@ _HEADER = """\
  * returned, so apply them as they are.
  *
  * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
- * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS for a
- * quarter of them. An iteration costs the same each time, up to the 10 trial steps of its line search.
+ * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS + 4
+ * for a quarter of them, rounded up. An iteration costs the same each time, up to the 10 trial steps of its line
+ * search.
  */
 #ifndef MPC_CONTROLLER_H
 #define MPC_CONTROLLER_H

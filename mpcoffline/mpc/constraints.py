@@ -16,7 +16,7 @@ from mpcoffline.core.registry import Registry
 from mpcoffline.core.text import check_name
 from mpcoffline.core.types import Array
 
-from .expressions import function_from_json, function_to_json, traced
+from .expressions import function_from_json, function_to_json, instructions, traced
 from .layout import Layout
 from .parameters import ParameterSpace
 from .signals import takes_signals
@@ -132,19 +132,18 @@ class Constraint(AnyConstraint):
             outside = [sizes.layout.named(symbols[0][sizes.layout.present.tolist()])]
         try:
             h = ca.densify(ca.SX(self.function(*arguments[:-1], sizes.parameters.symbols(arguments[-1]), *outside)))
-        except (TypeError, NotImplementedError, RuntimeError) as error:
+        except (TypeError, KeyError, NotImplementedError, RuntimeError) as error:
             raise InvalidArgumentError(
                 self.name, expected="a function of CasADi SX expressions", actual=f"{type(error).__name__}: {error}"
             ) from error
         if h.shape[1] != 1 or h.shape[0] == 0:
             raise InvalidArgumentError(self.name, expected="a column", actual=f"shape {h.shape}")
-        if not ca.depends_on(h, ca.vertcat(symbols[0][: sizes.n_states], *arguments[1:-1])):
-            raise InvalidArgumentError(
-                self.name,
-                expected="a limit of the plant's states or inputs, which a plan can change",
-                actual="one of signals, parameters or numbers alone",
-            )
-        return replace(self, function=traced(self.name, ca.Function("h", arguments, [h])))
+        _check_changeable(self.name, h, ca.vertcat(symbols[0][: sizes.n_states], *arguments[1:-1]))
+        function = traced(self.name, ca.Function("h", arguments, [h]))
+        if any(np.isinf(instruction.constant) for instruction in instructions(function)):
+            hint = "Leave out the elements that bound nothing."
+            raise InvalidArgumentError(self.name, expected="finite numbers", actual="an infinite one", hint=hint)
+        return replace(self, function=function)
 
     def to_json(self) -> dict[str, Any]:
         """A JSON-able description of a fitted constraint."""
@@ -186,20 +185,31 @@ class StateBounds(AnyConstraint):
         high: Upper bounds, ``(nx,)``.
         name: What it is called in a solution's status.
         soft: None for hard bounds, else the price of violating them.
+        at_end: Without it soft bounds hold at k = 0 ... N - 1, as other limits of a stage: where the terminal cost is a
+            value that knows their price at x_N. What x_0 costs is then a part of the MPC's value.
 
     Raises:
-        InvalidArgumentError: For bounds that cross, are NaN or of different shapes, or that no number can keep.
+        InvalidArgumentError: For bounds that cross, are NaN or of different shapes, or that no number can keep; for
+            hard ones without ``at_end``.
     """
 
     low: ArrayLike
     high: ArrayLike
     name: str = "state bounds"
     soft: Penalty | None = None
+    at_end: bool = True
 
     def __post_init__(self) -> None:
         check_name("name of a constraint", self.name)
         object.__setattr__(self, "soft", _checked_penalty(self.name, self.soft))
-        low, high = (np.atleast_1d(np.array(bound, dtype=np.float64)) for bound in (self.low, self.high))
+        if not self.at_end and self.soft is None:
+            raise InvalidArgumentError(f"{self.name}.at_end", expected="True for hard bounds", actual="False")
+        try:
+            low, high = (np.atleast_1d(np.array(bound, dtype=np.float64)) for bound in (self.low, self.high))
+        except (TypeError, ValueError) as error:
+            raise InvalidArgumentError(
+                self.name, expected="numbers", actual=f"{self.low!r} and {self.high!r}"
+            ) from error
         if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
             raise InvalidArgumentError(self.name, expected="low <= high of one shape", actual=f"{low} and {high}")
         if (low == np.inf).any() or (high == -np.inf).any():
@@ -239,14 +249,21 @@ class StateBounds(AnyConstraint):
             "soft": None if self.soft is None else list(self.soft),
             "low": _finite_or_none(np.asarray(self.low)),
             "high": _finite_or_none(np.asarray(self.high)),
+            "at_end": self.at_end,
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any], sizes: Sizes) -> Self:
-        """The inverse of ``to_json``."""
+        """The inverse of ``to_json``.
+
+        Raises:
+            FileFormatError: If the data are damaged.
+        """
+        if not isinstance(at_end := data["at_end"], bool):
+            raise FileFormatError("constraint: at_end", expected="true or false", actual=repr(at_end)[:200])
         low = [-np.inf if v is None else float(v) for v in data["low"]]
         high = [np.inf if v is None else float(v) for v in data["high"]]
-        return cls(low, high, data["name"], _penalty_from_json(data["soft"]))
+        return cls(low, high, data["name"], _penalty_from_json(data["soft"]), at_end)
 
 
 Constraints = ConstraintFunction | AnyConstraint | Sequence[AnyConstraint]
@@ -282,6 +299,21 @@ def fitted_constraints(given: Constraints | None, sizes: Sizes) -> tuple[Constra
         raise InvalidArgumentError("names of constraints", expected="unique names", actual=str(names))
     _refuse_contradicting([form for form in fitted if isinstance(form, StateBounds) and form.soft is None], sizes)
     return tuple(form for form in fitted if not _is_empty(form)) or None
+
+
+def _check_changeable(name: str, h: ca.SX, z: ca.SX) -> None:
+    """Refuses a limit that no plan can change, which consists of z, and one of whose change solvers see nothing."""
+    if not ca.depends_on(h, z):
+        raise InvalidArgumentError(
+            name,
+            expected="a limit of the plant's states or inputs, which a plan can change",
+            actual="one of signals, parameters or numbers alone",
+        )
+    slopes = ca.jacobian(h, z)
+    if any(slopes[j, :].is_zero() and ca.depends_on(h[j], z) for j in range(h.numel())):
+        raise InvalidArgumentError(
+            name, expected="h <= 0 that grows with what is limited, as x[0] - 1", actual="a step, as x[0] <= 1"
+        )
 
 
 def _is_empty(form: Constraint | StateBounds) -> bool:

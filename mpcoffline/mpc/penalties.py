@@ -45,6 +45,16 @@ def limit_expressions(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> list[tuple[
     return [each for each in found if each[2].numel()]
 
 
+def paid_in_value(mpc: MPC) -> MPC:
+    """The problem without soft bounds at x_N, whose price there its terminal cost knows."""
+    given = mpc.constraints if isinstance(mpc.constraints, tuple) else ()
+    soft = [isinstance(each, StateBounds) and each.soft is not None and each.at_end for each in given]
+    if not any(soft):
+        return mpc
+    changed = [replace(each, at_end=False) if chosen else each for each, chosen in zip(given, soft, strict=True)]
+    return mpc.replace(constraints=changed)
+
+
 def repriced(mpc: MPC, factor: float) -> MPC:
     """The problem with the prices of its soft limits multiplied, as where its costs are.
 

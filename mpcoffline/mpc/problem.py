@@ -305,7 +305,7 @@ class MPC:
 
     @property
     def state_bounds(self) -> list[StateBounds]:
-        """The bounds of x_1 ... x_N, on z; what they are not of has none."""
+        """The bounds of x_1 ... x_N, or without ``at_end`` of x_0 ... x_{N-1}, on z; what they are not of has none."""
         return [c.padded(self.nx - np.size(c.low)) for c in self._constraints if isinstance(c, StateBounds)]
 
     @property

@@ -119,14 +119,14 @@ class Limit:
 
     Args:
         name: What messages call it.
-        of: The name of a state, input or signal, or a function of ``x``, ``u``, ``d``, ``p`` (those that it names).
+        of: The name of a state or input, or a function of ``x``, ``u``, ``d``, ``p`` (those that it names).
         low: The least that it may be.
         high: The largest.
         soft: What a unit of violation costs, in units of the cost (an exact penalty: where the limit can be kept at a
             lower price, it is); by default the limit is hard. A pair is the price of the violation and of its square.
 
     Raises:
-        InvalidArgumentError: For a limit without bounds, or bounds that cross.
+        InvalidArgumentError: For a limit without bounds, bounds that cross or are no numbers, or more than two prices.
     """
 
     name: str
@@ -140,8 +140,14 @@ class Limit:
         what = f"limit {self.name!r}"
         of: object = self.of
         if not isinstance(of, str) and not callable(of):
-            expected = "the name of a state, input or signal, or a function of x, u, d, p"
+            expected = "the name of a state or input, or a function of x, u, d, p"
             raise InvalidArgumentError(what, expected=expected, actual=repr(self.of)[:200])
+        for bound in (self.low, self.high):
+            if isinstance(bound, bool) or not isinstance(bound, int | float | np.number):
+                raise InvalidArgumentError(f"{what}: bounds", expected="two numbers", actual=repr(bound)[:200])
+        prices: object = self.soft
+        if isinstance(prices, Sequence) and not isinstance(prices, str) and len(prices) != 2:
+            raise InvalidArgumentError(f"{what}: soft", expected="a price, or a pair", actual=repr(prices)[:200])
         if not self.low <= self.high or (math.isinf(self.low) and math.isinf(self.high)):
             raise InvalidArgumentError(what, expected="low <= high, one of them", actual=f"{self.low} and {self.high}")
 

@@ -15,6 +15,8 @@ from mpcoffline.mpc import MPC, Penalty, StateBounds
 class Limits(NamedTuple):
     """All elements h_j <= 0, in three blocks: of constraints along the horizon, of state bounds, of those at the end.
 
+    Bounds without ``at_end`` are the last of the first block.
+
     Attributes:
         stage: What holds at the stages 0 ... N - 1: the first two blocks, bounds from stage 1 on.
         end: What holds at N: the last two blocks.
@@ -50,8 +52,11 @@ def limits_of(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> Limits | None:
         h = mpc.constraint_expression(constraint)(x, u, theta)
         along = ca.vertcat(along, ca.densify(h))
         add(element_names(constraint.name, h.numel()), constraint.soft)
-    for bound in mpc.state_bounds:
-        bounds = ca.vertcat(bounds, bound.expression(x))
+    for bound in sorted(mpc.state_bounds, key=lambda each: each.at_end):
+        if bound.at_end:
+            bounds = ca.vertcat(bounds, bound.expression(x))
+        else:
+            along = ca.vertcat(along, bound.expression(x))
         add(_bound_names(bound), bound.soft)
     for constraint in mpc.constraints_at("end"):
         h = mpc.constraint_expression(constraint)(x, theta)

@@ -71,7 +71,8 @@ def _elements(mpc: MPC) -> Iterator[tuple[Constraint | StateBounds, slice, bool]
     end = [c for c in given if isinstance(c, Constraint) and c.terminal]
     x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
     first = 0
-    ordered: list[Constraint | StateBounds] = [*along, *(c for c in given if isinstance(c, StateBounds)), *end]
+    bounds = sorted((c for c in given if isinstance(c, StateBounds)), key=lambda each: each.at_end)
+    ordered: list[Constraint | StateBounds] = [*along, *bounds, *end]
     for constraint in ordered:
         if isinstance(constraint, StateBounds):
             h = constraint.padded(mpc.nx - np.size(constraint.low)).expression(x)

@@ -1,4 +1,4 @@
-"""The page that both scripts write, each its own part of it."""
+"""Pages that several scripts write, each its own part of one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pathlib import Path
 
 TITLE = "# Hostile files and interruptions, measured"
 PARTS = ("Hostile files", "Interruptions")
+LIMITS_TITLE = "# Limits, measured"
+LIMITS = ("Speed", "Agreement", "Random problems", "Hostile problems", "Plants")
 
 
 def heading(script: str) -> list[str]:
@@ -24,15 +26,17 @@ def heading(script: str) -> list[str]:
     ]
 
 
-def write_part(path: Path, part: str, lines: list[str]) -> None:
-    """Replaces one part of the page; the other stays.
+def write_part(path: Path, part: str, lines: list[str], *, title: str = TITLE, names: tuple[str, ...] = PARTS) -> None:
+    """Replaces one part of a page; the others stay.
 
     Args:
         path: The page, which may not exist yet.
-        part: One of :data:`PARTS`.
+        part: One of the names.
         lines: Its content, without its own heading.
+        title: Of the page.
+        names: Of its parts, in their order.
     """
-    parts = dict.fromkeys(PARTS, "")
+    parts = dict.fromkeys(names, "")
     if path.exists():
         for text in path.read_text(encoding="utf-8").split("\n## ")[1:]:
             name, _, content = text.partition("\n")
@@ -41,4 +45,4 @@ def write_part(path: Path, part: str, lines: list[str]) -> None:
     parts[part] = "\n".join(lines).strip("\n")
     sections = [f"## {name}\n\n{content}\n" for name, content in parts.items() if content]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join([TITLE, "", *sections]), encoding="utf-8")
+    path.write_text("\n".join([title, "", *sections]), encoding="utf-8")

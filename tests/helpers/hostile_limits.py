@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from random_limits import RandomProblem
 
+from mpcoffline.control.export import export_c
+from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.mpc import MPC, Constraint, Penalty, StateBounds
+from mpcoffline.solvers import DDPSolver, Solution
 from mpcoffline.solvers.ddp.build import flags_of
 from mpcoffline.solvers.ddp.codegen import source
+from mpcoffline.solvers.limits import limits_of
 from mpcoffline.solvers.starts import candidate_inputs
 
 Array = NDArray[np.float64]
@@ -53,6 +57,147 @@ def hostile_states(nx: int, n: int, rng: np.random.Generator) -> Array:
     states[n // 4 :] *= size[n // 4 :, None]
     states[:: max(1, n // 7)] = 0.0
     return states
+
+
+def hostile_thetas(mpc: MPC, n: int, rng: np.random.Generator) -> Array:
+    """``(n, size)``, all within their bounds: half near the MPC's own, others by many orders of magnitude off, or 0."""
+    theta = np.tile(mpc.theta, (n, 1)) * np.exp(rng.uniform(-1.0, 1.0, (n, mpc.space.size)))
+    theta += 0.1 * np.abs(mpc.theta).max() * rng.normal(size=theta.shape)
+    far = rng.uniform(size=n) < 0.5
+    theta[far] *= 10.0 ** rng.uniform(-40.0, 40.0, (int(far.sum()), 1))
+    theta[:: max(1, n // 5)] = 0.0
+    return np.asarray(np.clip(theta, mpc.space.low, mpc.space.high))
+
+
+def spoiled(values: Array, rng: np.random.Generator) -> Array:
+    """The rows with NaN or an infinity in one place each."""
+    bad = values.copy()
+    places = rng.integers(values.shape[1], size=len(values))
+    bad[np.arange(len(values)), places] = rng.choice([np.nan, np.inf, -np.inf], size=len(values))
+    return bad
+
+
+class Claims(NamedTuple):
+    """What a solution claims to have solved, and is wrong about.
+
+    Attributes:
+        not_finite: NaN or inf in its plan or cost.
+        not_model: The plan is not what the model does with its inputs, or these are out of their bounds.
+        violated: A hard limit is violated by more than a millionth of what it is measured by.
+        over_budget: Problems, solved or not, that took more iterations than they may.
+    """
+
+    not_finite: int
+    not_model: int
+    violated: int
+    over_budget: int
+
+
+def wrong_claims(solver: DDPSolver, x: Array, theta: Array, solution: Solution, budget: int) -> Claims:
+    """Judges plans by the MPC's own functions in CasADi, which the solver's C does not share.
+
+    Args:
+        solver: Of the problem.
+        x: States, ``(B, nx)``.
+        theta: Parameters, ``(B, size)``.
+        solution: What the solver found from there.
+        budget: Iterations that a problem may take.
+    """
+    mpc, N = solver.mpc, solver.mpc.horizon
+    rows = np.flatnonzero(solution.success)
+    u, states, parameters = solution.u[rows], x[rows].T, theta[rows].T
+    finite = np.isfinite(solution.value[rows]) & np.isfinite(solution.x[rows]).all(axis=(1, 2))
+    finite &= np.isfinite(u).all(axis=(1, 2))
+    inside = ((u >= np.asarray(mpc.action_low)) & (u <= np.asarray(mpc.action_high))).all(axis=(1, 2))
+    limits = _limits(mpc)
+    assert solution.multipliers is not None
+    scales = solution.multipliers[rows, -1]
+    along, kept = np.ones(len(rows), dtype=bool), np.ones(len(rows), dtype=bool)
+    for k in range(N + 1):
+        inputs = u[:, k].T if k < N else np.zeros((mpc.nu, len(rows)))
+        h = limits(states, inputs, parameters, float(k == 0), float(k == N)).full().T
+        kept &= (h <= 1.01e-6 * scales).all(axis=1)
+        near = np.abs(states.T - solution.x[rows, k])
+        along &= (near <= 1e-6 * (np.abs(states.T) + np.abs(solution.x[rows, :]).max(axis=1))).all(axis=1)
+        if k < N:
+            states = mpc.dynamics_function(solution.x[rows, k].T, inputs, parameters).full()
+    over = solution.stats["iterations"] > budget
+    return Claims(*(int(bad.sum()) for bad in (~finite, finite & ~(along & inside), finite & ~kept, over)))
+
+
+def _limits(mpc: MPC) -> ca.Function:
+    """``(x, u, theta, first, last) -> h`` of all limits, as multipliers, -inf where they are not imposed."""
+    x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
+    first, last = ca.SX.sym("first"), ca.SX.sym("last")
+    found = limits_of(mpc, x, u, theta)
+    assert found is not None
+    n, bounds = len(found.labels), slice(found.n_stage, found.n_stage + found.n_bounds)
+    h = ca.SX.zeros(n)
+    h[: bounds.stop], h[bounds.stop :] = found.stage, found.end[found.n_bounds :]
+    hard = np.isinf(found.l1)
+    for j in range(n):
+        at_stage, at_end = j < bounds.stop, j >= bounds.start
+        free = 1.0 - float(found.by_input[j])  # at stage 0
+        imposed = (1 - last) * float(at_stage) * (1 - first * free) + last * float(at_end)
+        h[j] = ca.if_else(imposed * float(hard[j]) > 0.5, h[j], -ca.inf)
+    return ca.Function("limits", [x, u, theta, first, last], [h])
+
+
+_CONTROLLER = """
+#include <stdint.h>
+#include <stdio.h>
+#include "mpc_controller.h"
+int64_t counted;
+int main(void) {
+    static mpc_state state;
+    static double row[MPC_NP + MPC_NY + 2], u[MPC_NU];
+    while (fread(row, sizeof row, 1, stdin) == 1) {
+        if (row[0]) mpc_reset(&state);
+        counted = 0;
+        int answer = mpc_step((const mpc_parameters *)(row + 1), &state, row + 1 + MPC_NP, u);
+        double found[2] = {answer, (double)counted};
+        fwrite(found, sizeof found, 1, stdout);
+        fwrite(u, sizeof u, 1, stdout);
+    }
+    return 0;
+}
+"""
+
+
+class Exported:
+    """The C of an MPC, compiled so that it counts its iterations.
+
+    Args:
+        mpc: The MPC.
+        folder: For its files.
+        flags: Of gcc.
+    """
+
+    def __init__(self, mpc: MPC, folder: Path, *flags: str) -> None:
+        self._mpc, self._program = mpc, folder / "controller"
+        export_c(MPCPolicy(mpc, "ddp"), folder)
+        text = (folder / "mpc_controller.c").read_text()
+        call = "iterate(m, w, -1, &converged, &moved, &stalled);"
+        assert text.count(call) == 1
+        text = "#include <stdint.h>\nextern int64_t counted;\n" + text.replace(call, f"++counted, {call}")
+        (folder / "counting.c").write_text(text)
+        (folder / "main.c").write_text(_CONTROLLER)
+        command = ["gcc", "-std=c99", "-w", *flags, "-I.", "counting.c", "main.c", "-o", "controller", "-lm"]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
+
+    def __call__(
+        self, resets: Array, thetas: Array, y: Array, seconds: float | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Steps one after another: what each returns, its iterations, and the inputs ``(B, nu)``.
+
+        Raises:
+            subprocess.TimeoutExpired: If they take longer than that.
+            subprocess.CalledProcessError: If the program ends in another way than by its last line.
+        """
+        rows = np.hstack([resets[:, None], thetas, y, np.zeros((len(y), 1))])
+        done = subprocess.run([self._program], input=rows.tobytes(), capture_output=True, check=True, timeout=seconds)
+        found = np.frombuffer(done.stdout).reshape(len(y), 2 + self._mpc.nu)
+        return found[:, 0], found[:, 1], found[:, 2:]
 
 
 _MAIN = """

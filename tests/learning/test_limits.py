@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import lq_plant
@@ -9,13 +10,17 @@ import numpy as np
 import pytest
 from lq_episodes import episodes
 from numpy.typing import NDArray
+from riccati import optimum
 
 from mpcoffline import OfflineMPCLearner, TransitionTable
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.learning.bellman.stages import Terminal, TerminalConfig, with_terminal_cost
 from mpcoffline.learning.known_limits import limit_costs_of
+from mpcoffline.learning.stages import Known, KnownCost
 from mpcoffline.mpc import MPC, Constraint, Model, Parameter, Penalty, StateBounds
 from mpcoffline.mpc.penalties import penalty_function, repriced
 from mpcoffline.simulation.logged_cost import LoggedCost
+from mpcoffline.solvers import DDPSolver
 
 Array = NDArray[np.float64]
 
@@ -105,6 +110,29 @@ def test_v_sees_them() -> None:
     assert more > 0.7 * np.mean(30.0 * over(beyond).sum(axis=1))
 
 
+@pytest.mark.parametrize("terminal", ["quadratic", "network"])
+@pytest.mark.parametrize("horizon", [1, 6])
+def test_bounds_are_paid_for_once_where_v_is_the_terminal_cost(terminal: Terminal, horizon: int) -> None:
+    """Bounds of no room at l2 make W larger: V is known, and an MPC that ends in it has it for a value, for any N."""
+    bounds = StateBounds([0.0, 0.0], [0.0, 0.0], "middle", Penalty(l2=1.0))
+    more = StateBounds([0.0, -np.inf], [0.0, np.inf], "one more", Penalty(l2=1.0))
+    valve = StateBounds([-50.0, -50.0], [50.0, 50.0], "walls")
+    mpc = limited([bounds, more, valve], horizon=horizon)
+    best = optimum(lq_plant.A, lq_plant.B, lq_plant.W + np.diag([2.0, 1.0]), lq_plant.R, lq_plant.DISCOUNT)
+    value = lq_plant.QuadraticValue(best.P)
+    limits = limit_costs_of(mpc, paid())
+    assert limits is not None
+    assert not limits.logged
+    known = Known(mpc, LOG, value_function=value, cost=KnownCost(), limits=limits, given=mpc)
+    made = with_terminal_cost(known, TerminalConfig(terminal)).mpc
+    solution = DDPSolver(made).solve(STATES[:20])
+    np.testing.assert_allclose(solution.value, lq_plant.quadratic(best.P, STATES[:20]), rtol=0.02, atol=0.02)
+    np.testing.assert_allclose(solution.u0, STATES[:20] @ best.K.T, rtol=0.02, atol=0.02)
+    assert [each.at_end for each in made.state_bounds] == [False, False, True]
+    unseen = with_terminal_cost(dataclasses.replace(known, limits=None), TerminalConfig(terminal)).mpc
+    assert all(each.at_end for each in unseen.state_bounds)
+
+
 def test_prices_of_a_learned_cost_are_in_its_unit() -> None:
     learner = OfflineMPCLearner(limited(W=np.diag([2.0, 0.7])), stage_cost="fitted", candidate="full", **QUICK)
     learner.fit(paid(1e3), show_progress=False)
@@ -125,6 +153,18 @@ def test_simulations_pay_for_them() -> None:
         plain = lq_plant.quadratic(lq_plant.W, s) + lq_plant.quadratic(lq_plant.R, a)
         np.testing.assert_allclose(cost(s, a), 2.0 * (plain + price(s)), rtol=1e-4)
         assert "2 times the prices of soft limits" in str(cost)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_a_back_off_of_zero_has_the_unit_of_its_limit(unit: float) -> None:
+    """It has neither a size nor a range: the plant's costs rise from 0.5 on, the MPC believes that they do from 0.7."""
+    parameters = {"A": lq_plant.A, "B": lq_plant.B, "backoff": 0.0}
+    model = Model(lambda x, u, p: p["A"] @ x + p["B"] @ u, 2, 1, 0.1, parameters, discrete=True)
+    limit = Constraint(lambda x, u, p: unit * (x[0] - 0.7) + p["backoff"], "room", Penalty(20.0 / unit))
+    mpc = limited(None).replace(model=model, constraints=limit)
+    learner = OfflineMPCLearner(mpc, "cost+model+constraints", candidate="full", prior=1e-3, **QUICK)
+    learner.fit(paid(limits=20.0 * over(STATES, 0.5)[:, 0]), show_progress=False)
+    assert float(learner.mpc.values["model.backoff"]) / unit == pytest.approx(0.2, abs=1e-3)
 
 
 def backed_off(value: float, soft: Penalty | None) -> MPC:

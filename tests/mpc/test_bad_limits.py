@@ -56,6 +56,20 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: limited(Constraint(lambda x, u, p: u, "end", terminal=True)),
         r"end: expected a function of CasADi SX expressions",
     ),
+    "a comparison": (
+        lambda: limited(Constraint(lambda x, u, p: ca.vertcat(x[1] - 1.0, x[0] <= 1.0), "h")),
+        r"h: expected h <= 0 that grows .* got a step",
+    ),
+    "an infinite bound": (
+        lambda: limited(Constraint(lambda x, u, p: x[:2] - ca.DM([1.0, INF]), "h")),
+        r"h: expected finite numbers, got an infinite one. Leave out",
+    ),
+    "NaN in h": (lambda: limited(Constraint(lambda x, u, p: x[0] - np.nan, "h")), r"h: .*constant NaN"),
+    "an unknown parameter": (
+        lambda: limited(Constraint(lambda x, u, p: x[0] - p["least"], "h")),
+        r"h: expected a function .* KeyError: 'least'",
+    ),
+    "a text for a bound": (lambda: StateBounds(["low"], [1.0], "level"), r"level: expected numbers"),
     "a name that occurs twice": (
         lambda: limited(StateBounds([0, 0], [1, 1], "level"), StateBounds([0, 0], [1, 1], "level")),
         r"names of constraints: expected unique names",

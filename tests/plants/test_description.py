@@ -188,6 +188,10 @@ def test_what_does_not_fit_is_told_by_name_and_line(changes: dict[str, Any], mes
         (lambda: Input("u", "V", 0, 1, delay=-1), "input u: delay: expected an integer >= 0"),
         (lambda: Limit("l", "h1"), "limit 'l': expected low <= high, one of them"),
         (lambda: Limit("l", 3), "limit 'l': expected the name of a state"),  # type: ignore[arg-type]
+        (lambda: Limit("l", "h1", high="1"), "limit 'l': bounds: expected two numbers, got '1'"),  # type: ignore[arg-type]
+        (lambda: Limit("l", "h1", high=float("nan")), "limit 'l': expected low <= high"),
+        (lambda: Limit("l", "h1", 3.0, 1.0), "limit 'l': expected low <= high"),
+        (lambda: Limit("l", "h1", 3.0, soft=(1, 2, 3)), "limit 'l': soft: expected a price, or a pair"),  # type: ignore[arg-type]
         (lambda: Signal("s", low=2, high=1), "range of signal s: expected low < high"),
         (lambda: Parameter(1.0, spread=2.0), "Parameter spread"),
     ],

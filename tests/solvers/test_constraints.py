@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Constraint, Model, Penalty, QuadraticCost, StateBounds
-from mpcoffline.solvers import IpoptSolver
+from mpcoffline.solvers import DDPSolver, IpoptSolver, Status
 
 Array = NDArray[np.float64]
 N, DISCOUNT = 6, 0.95
@@ -128,24 +129,34 @@ def test_an_l1_penalty_above_the_multiplier_is_exact() -> None:
     assert soft.value == pytest.approx(float(hard.value), rel=1e-6)
 
 
+@pytest.mark.parametrize("solver", [IpoptSolver, DDPSolver])
+@pytest.mark.parametrize("at_end", [True, False])
 @pytest.mark.parametrize("weights", [Penalty(l1=0.3), Penalty(l2=2.0), Penalty(l1=0.1, l2=1.0)])
-def test_weak_penalties_weigh_violation_against_cost(weights: Penalty) -> None:
+def test_weak_penalties_weigh_violation_against_cost(weights: Penalty, at_end: bool, solver: Any) -> None:
     """Violated a little: the value is the cost plus gamma^k (l1 s + l2 s^2), by another algorithm too."""
+    stages = slice(1, N + 1) if at_end else slice(N)
+    start = np.array([START[0], -0.6])
 
     def penalty(states: Array) -> float:
-        s = np.maximum(-0.5 - states[1:, 1], 0.0)
-        return float(DISCOUNT ** np.arange(1, N + 1) @ (weights.l1 * s + weights.l2 * s**2))
+        s = np.maximum(-0.5 - states[:, 1], 0.0)
+        return float((DISCOUNT ** np.arange(N + 1) * (weights.l1 * s + weights.l2 * s**2))[stages].sum())
 
-    mpc = double_integrator(constraints=StateBounds([-np.inf, -0.5], [np.inf, np.inf], soft=weights))
-    solution = IpoptSolver(mpc).solve(START)
+    walls = StateBounds([-99.0, -99.0], [99.0, 99.0], "walls")
+    slow = StateBounds([-np.inf, -0.5], [np.inf, np.inf], soft=weights, at_end=at_end)
+    solution = solver(double_integrator(constraints=[walls, slow])).solve(start)
     assert solution.success
-    assert solution.x[:, 1].min() < -0.55
-    own = cost(START, solution.u[:, 0]) + penalty(solution.x)
-    assert solution.value == pytest.approx(own, rel=1e-9)
-    truth = by_slsqp(START, penalty=penalty)
-    assert own <= cost(START, truth) + penalty(trajectory(START, truth)) + 1e-6
+    assert solution.x[1:, 1].min() < -0.55
+    own = cost(start, solution.u[:, 0]) + penalty(solution.x)
+    assert solution.value == pytest.approx(own, rel=1e-6)
+    truth = by_slsqp(start, penalty=penalty)
+    assert own <= cost(start, truth) + penalty(trajectory(start, truth)) + 1e-6
     if not weights.l1:  # smooth, so that the other algorithm converges too
         np.testing.assert_allclose(solution.u[:, 0], truth, atol=1e-4)
+
+
+def test_hard_bounds_hold_at_the_end() -> None:
+    with pytest.raises(InvalidArgumentError, match="at_end: expected True for hard bounds"):
+        StateBounds([-1.0], [1.0], "room", at_end=False)
 
 
 def test_soft_constraints_are_never_infeasible() -> None:
@@ -179,9 +190,11 @@ def test_soft_constraints_are_never_infeasible() -> None:
         ),
     ],
 )
-def test_the_violated_constraint_is_named(constraints: Any, named: str) -> None:
-    solution = IpoptSolver(double_integrator(constraints=constraints)).solve([[6.0, 0.0]])
+@pytest.mark.parametrize("solver", [IpoptSolver, DDPSolver])
+def test_the_violated_constraint_is_named(constraints: Any, named: str, solver: Any) -> None:
+    solution = solver(double_integrator(constraints=constraints)).solve([[6.0, 0.0]])
     assert solution.success.tolist() == [False]
+    assert solution.status == [Status.INFEASIBLE]
     assert solution.stats["violation"][0] > 0.1
     with pytest.raises(AssertionError, match=named):
         raise AssertionError(solution.words[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.learning.limit_costs import LimitCosts
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.penalties import penalty_function
+from mpcoffline.mpc.penalties import limit_expressions, penalty_function
 from mpcoffline.mpc.torch_twin import TorchTwin
 
 from .equation import BellmanProblem
@@ -80,7 +81,7 @@ def refit_limits(
         problem: The regression error without limits.
         sample: The transitions, without P_0 in their costs.
         limits: P_0.
-        prior: l2; distances in the parameter's own size.
+        prior: l2; distances in the parameter's range, else its size, else what moves its limit as far as the data do.
 
     Returns:
         All parameters, and the regression error there.
@@ -94,7 +95,7 @@ def refit_limits(
         rest = problem.target(sample) - problem.predicted_value(sample, fixed) - problem.stage_cost(sample, fixed)
         rest = rest + torch.from_numpy(limits(s.numpy(), a.numpy()))
     start, low, high = theta[index], mpc.space.low[index], mpc.space.high[index]
-    size = _sizes(start, low, high)
+    size = _sizes(start, low, high, lambda: _reach(mpc, theta, index, s.numpy(), a.numpy()))
 
     def error(z: Tensor) -> Tensor:
         full = fixed.index_put((torch.from_numpy(index),), torch.from_numpy(start) + torch.from_numpy(size) * z)
@@ -122,8 +123,36 @@ def refit_limits(
         return result, float(error(torch.from_numpy(z)))
 
 
-def _sizes(value: Array, low: Array, high: Array) -> Array:
-    """What each is measured by: its range, else its size, else 1."""
+def _sizes(value: Array, low: Array, high: Array, reach: Callable[[], Array]) -> Array:
+    """What each is measured by, ``(p,)``: its range, else its size, else what its limit says."""
     ranges = np.where(np.isfinite(high - low), high - low, 0.0)
     size = np.where(ranges > 0.0, ranges, np.abs(value))
-    return np.where(size > 0.0, size, 1.0)
+    return size if (size > 0.0).all() else np.where(size > 0.0, size, reach())
+
+
+def _reach(mpc: MPC, theta: Array, index: Array, s: Array, a: Array) -> Array:
+    """By how much a parameter must move so that a limit of it does as much as over the data, ``(p,)``.
+
+    ::
+
+        unit = spread of h / |dh / dp|          (of the limit that it moves most; root mean square over the data)
+
+    Args:
+        mpc: The MPC with the limits.
+        theta: Where derivatives are taken.
+        index: The parameters, ``(p,)``.
+        s: States, ``(B, nx)``.
+        a: Inputs, ``(B, nu)``.
+    """
+    x, u, p = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
+    h = ca.vertcat(*(h for _, soft, h in limit_expressions(mpc, x, u, p) if soft is not None))
+    slopes = ca.jacobian(h, p)[:, index.tolist()]
+    both = ca.Function("limits", [x, u, p], [ca.densify(h), ca.vec(ca.densify(slopes))])
+    at, moved = (v.full() for v in both(s.T, a.T, theta))
+    known = np.isfinite(at).all(axis=0) & np.isfinite(moved).all(axis=0)
+    if not known.any():
+        return np.ones(len(index))
+    spread = at[:, known].std(axis=1)
+    moved = np.sqrt(np.mean(moved[:, known] ** 2, axis=1)).reshape(len(index), -1)  # vec goes down the columns
+    share = np.divide(moved, spread, out=np.zeros_like(moved), where=spread > 0.0).max(axis=1)
+    return np.asarray(1.0 / np.where(share > 0.0, share, 1.0))  # 1 where nothing depends on it

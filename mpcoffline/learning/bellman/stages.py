@@ -24,7 +24,7 @@ from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.learning.value.training import ValueTraining
 from mpcoffline.mpc import MPC, NormCost, TerminalCost
-from mpcoffline.mpc.penalties import repriced
+from mpcoffline.mpc.penalties import paid_in_value, repriced
 
 from .regression import ParameterConfig, ParameterTraining
 
@@ -200,7 +200,8 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
 
     The exact value of an MPC is V - Phi of its own: Phi changes none of its inputs. Where all logged costs are one
     number, V is in no unit of the stage cost: then the given terminal cost stays, and with it the given horizon, unless
-    one was asked for (``horizon``).
+    one was asked for (``horizon``). Where V knows what soft limits cost, bounds of states are not asked at x_N besides:
+    by Theorem 1 (doi:10.1109/TAC.2019.2913768) all that is paid there is V.
     """
     if config.method == "given":
         return known
@@ -226,6 +227,8 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
             ends=_ends(known, potential),
         )
     mpc = known.mpc.replace(terminal_cost=cost)
+    if exact is None and config.method != "norm" and known.limits is not None:
+        mpc = paid_in_value(mpc)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
 
 

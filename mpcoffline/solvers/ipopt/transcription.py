@@ -137,7 +137,8 @@ class Transcription:
             add(constraint.name, mpc.constraint_expression(constraint)(x[n], self.theta_at(n)), constraint.soft, n)
         for bounds in mpc.state_bounds:
             if bounds.soft is not None:
-                soft += [(bounds.expression(x[k]), bounds.soft, k) for k in range(1, n + 1)]
+                stages = range(int(bounds.at_end), n + int(bounds.at_end))
+                soft += [(bounds.expression(x[k]), bounds.soft, k) for k in stages]
 
     def bounds(self, u0: Array | None) -> tuple[Array, Array]:
         """Lower and upper bounds of the variables, with the first input imposed where it is given."""
