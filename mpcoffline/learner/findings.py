@@ -25,6 +25,9 @@ def findings(given: MPC, learned: MPC, result: FitResult | None) -> tuple[str, .
         found.append(f"Prices of soft limits: V has learned them, {seen}{unit}.")
     if learned.model.delay != given.model.delay:
         found.append(f"Dead time: {list(learned.layout.delay)} steps, found in the log.")
+    if learned.applied_before is not None and given.applied_before is None:
+        applied = ", ".join(f"{value:.4g}" for value in learned.usual_input)
+        found.append(f"Before an episode, inputs of [{applied}] count as applied, as the log's first rows say.")
     if learned.model.scheme is not None and learned.model.scheme != given.model.scheme:
         found.append(f"Integrator: {learned.model.scheme}, chosen from the log.")
     if result is not None and result.residual_share is not None:

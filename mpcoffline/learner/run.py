@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.text import listed
 from mpcoffline.datasets.table.memory import with_memory
+from mpcoffline.estimation.beginnings import beginnings
 from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
 from mpcoffline.learning.ends import innermost
 from mpcoffline.learning.stages import Arrays, Change
@@ -117,7 +118,8 @@ class Run:
         known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
         table = with_memory(known.table, known.mpc.layout)
         n = known.mpc.layout.n_states
-        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n))
+        begun = beginnings(known.table, known.mpc.layout, known.seed)
+        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n), begun=begun)
 
     @property
     def learned(self) -> Callable[[], MPC] | None:

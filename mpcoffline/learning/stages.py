@@ -134,6 +134,7 @@ class Known:
         given: MPC_1, of which the method may have changed horizon and discount.
         found: What identification found; None where the model was not identified.
         start: An MPC that was learned before, where searches begin, too; None without.
+        begun: The first transitions of episodes as they were logged; None where no past inputs are in the state.
     """
 
     mpc: MPC
@@ -150,6 +151,7 @@ class Known:
     given: MPC | None = None
     found: Identification | None = None
     start: MPC | None = None
+    begun: TransitionTable | None = None
 
     @property
     def constant_value(self) -> ValueFunction:

@@ -18,7 +18,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.types import Array
 
-from .component import StageCost, TerminalCost, cost_from_json
+from .component import StageCost, TerminalCost, cost_from_json, vector
 from .constraints import (
     Constraint,
     Constraints,
@@ -64,6 +64,8 @@ class MPC:
         action_high: Upper bounds, ``(nu,)``.
         constraints: ``(x, u, p) -> h`` with h <= 0 at every stage, a CasADi column, ``p`` as in the model; or a list of
             :class:`Constraint` and :class:`StateBounds`, which are named, may be soft, and may hold at the end only.
+        applied_before: Inputs that count as applied before anything is known, ``(nu,)``, where the state holds past
+            ones; by default the stage cost's ``u_ref``, else zero, and a learner takes them from the log.
 
     Raises:
         InvalidArgumentError: For a horizon that is not positive or above 10,000 steps, a discount outside (0, 1],
@@ -78,6 +80,7 @@ class MPC:
     action_low: ArrayLike
     action_high: ArrayLike
     constraints: Constraints | None = field(default=None, repr=False)
+    applied_before: ArrayLike | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         given = self.constraints if isinstance(self.constraints, Sequence) else (self.constraints,)
@@ -96,6 +99,8 @@ class MPC:
         object.__setattr__(self, "discount", discount)
         object.__setattr__(self, "action_low", low)
         object.__setattr__(self, "action_high", high)
+        if self.applied_before is not None:
+            object.__setattr__(self, "applied_before", vector("applied_before", self.applied_before, self.nu))
         object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
         _ = self.stage_function, self.terminal_function  # dimensions are refused here, not at the first solve
         rest, inputs = at_rest(self), extreme_inputs(self)
@@ -179,8 +184,9 @@ class MPC:
 
     @property
     def usual_input(self) -> Array:
-        """What counts as applied before anything is known, ``(nu,)``: the stage cost's ``u_ref``, else 0, in bounds."""
-        given = self.values.get("stage_cost.u_ref", np.zeros(self.nu))
+        """What counts as applied before anything is known, ``(nu,)``, in bounds: see ``applied_before``."""
+        known = self.applied_before
+        given = self.values.get("stage_cost.u_ref", np.zeros(self.nu)) if known is None else np.asarray(known)
         return np.clip(given, np.asarray(self.action_low), np.asarray(self.action_high))
 
     def state(self, y: ArrayLike, past: ArrayLike | None = None) -> Array:
@@ -348,6 +354,7 @@ class MPC:
             "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],
             "action_high": [_finite_or_none(v) for v in np.asarray(self.action_high)],
             "constraints": constraints_to_json(self._constraints, portable=portable) or None,
+            **({} if self.applied_before is None else {"applied_before": np.asarray(self.applied_before).tolist()}),
         }
 
     @classmethod
@@ -368,6 +375,7 @@ class MPC:
                 action_low=[-np.inf if v is None else v for v in data["action_low"]],
                 action_high=[np.inf if v is None else v for v in data["action_high"]],
                 constraints=constraints_from_json(data["constraints"], _sizes(model)),
+                applied_before=data.get("applied_before"),
             )
         except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             if isinstance(error, FileFormatError):

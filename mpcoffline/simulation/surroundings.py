@@ -56,7 +56,7 @@ def surroundings_of(
         InvalidDataError: If the data have other dimensions than the MPC.
     """
     logged = state_rows(mpc, table)
-    identified = nominal.with_delay(mpc.layout.delay).replace(model=found.model)
+    identified = nominal.with_delay(mpc.layout.delay).replace(model=found.model, applied_before=mpc.applied_before)
     clean = logged
     if len(found.table) == len(logged):
         clean = found.table
@@ -69,10 +69,11 @@ def surroundings_of(
     models = models.asked(most_models, identified=not choosing)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
     spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
+    fresh = False
     if len(clean) < len(table):
         whole = with_memory(table, mpc.layout, identified.usual_input)
         if _begins_as_usual(identified, whole):
-            logged, clean = whole, whole
+            logged, clean, fresh = whole, whole, True
             if not found.noise.negligible:
                 clean = smooth(identified, whole, found.theta, found.noise)
     rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)
@@ -81,7 +82,7 @@ def surroundings_of(
     n_before = mpc.layout.steps if len(clean) < len(table) else 0
     before = costs_before(table, clean, rows, n_before)
     steps = max(1, n_steps - n_before)
-    return Surroundings(models, cost, clean, rows, steps, mpc.layout, seed, spare, before, n_before, logged)
+    return Surroundings(models, cost, clean, rows, steps, mpc.layout, seed, spare, before, n_before, logged, fresh)
 
 
 def _begins_as_usual(mpc: MPC, table: TransitionTable) -> bool:

@@ -203,6 +203,7 @@ class Surroundings:
             controller; 0 by default.
         n_before: In how many steps.
         logged: The transitions as they were logged, where ``table`` is smoothed; its rows are those of the table.
+        fresh: Whether a controller is not told which inputs were applied before an episode of the table begins.
     """
 
     def __init__(
@@ -218,10 +219,11 @@ class Surroundings:
         before: Array | None = None,
         n_before: int = 0,
         logged: TransitionTable | None = None,
+        fresh: bool = False,
     ) -> None:
         self.logged = table if logged is None else logged
         self.models, self.cost, self.rows, self.n_steps, self._layout = models, cost, rows, n_steps, layout
-        self.usual, self.n_before = len(rows) - spare, n_before
+        self.usual, self.n_before, self.fresh = len(rows) - spare, n_before, fresh
         self.before = np.zeros(len(rows)) if before is None else before
         columns = table.values()
         self.starts = columns.observations[rows]
@@ -260,7 +262,7 @@ class Surroundings:
             signals: One after each step, ``(starts, n_steps, ny - n_states)``.
         """
         other = copy.copy(self)
-        other.starts, other.signals = starts, signals
+        other.starts, other.signals, other.fresh = starts, signals, False
         return other
 
     def act(self, controllers: Sequence[Controller], starts: slice = slice(None), kept: int = 0) -> list[Episodes]:
@@ -282,7 +284,7 @@ class Surroundings:
         lost, over = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
         states_kept, actions_kept = [x[:, :, :kept].copy()], []
-        courses = [self._course(controller, x[:, i]) for i, controller in enumerate(controllers)]
+        courses = [self._course(controller, x[:, i], self.begun[starts]) for i, controller in enumerate(controllers)]
         for k in range(self.n_steps):
             seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
             seen[..., :n] += noise[k]
@@ -314,11 +316,15 @@ class Surroundings:
             for i in range(c)
         ]
 
-    def _course(self, controller: Controller, x: Array) -> Course | None:
-        """What a controller is given of the time before: the inputs that were applied, as in midst of an episode."""
+    def _course(self, controller: Controller, x: Array, begun: NDArray[np.bool_]) -> Course | None:
+        """What a controller knows of the time before.
+
+        In midst of an episode it is the inputs that were applied; where one begins, what the controller takes for them.
+        """
         mpc, ny = getattr(controller, "mpc", None), self._layout.ny
         if mpc is None or not mpc.nx == x.shape[2] > ny:
             return None
-        past = x.reshape(-1, x.shape[2])[:, ny:]
+        fresh = begun[:, None] & self.fresh
+        past = np.where(fresh, mpc.layout.filled(mpc.usual_input), x[..., ny:]).reshape(-1, x.shape[2] - ny)
         plan = Plan.none(len(past), mpc)
         return Course(plan.x, plan.u, past, plan.multipliers)

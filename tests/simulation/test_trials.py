@@ -14,6 +14,7 @@ from lq_plant import BEST
 from numpy.typing import NDArray
 
 from mpcoffline import MPCPolicy
+from mpcoffline.control.course import Course
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.table.memory import with_memory
@@ -173,8 +174,21 @@ def test_episodes_begin_where_the_log_did_if_nothing_unusual_was_applied_before(
     assert around.n_before + around.n_steps == 20
     costs = log.values().costs.reshape(30, 20)
     assert set(np.round(around.returns, 6)) <= set(np.round(costs.sum(axis=1), 6))
+    heard = []
+
+    class Listens:
+        mpc = belt_mpc(2).replace(applied_before=[0.7])
+
+        def predict(self, observation: Array, state: Course) -> tuple[Array, Course]:
+            heard.append(np.asarray(state.memory))
+            return np.zeros((len(observation), 1)), state
+
+    around.act([Listens()])
     if before == 0.0:
         np.testing.assert_array_equal(around.starts[:, 1:], np.zeros((10, 2)))
+        np.testing.assert_array_equal(heard[0], np.full_like(heard[0], 0.7))  # nobody told it what was applied
+    else:
+        np.testing.assert_array_equal(heard[0], np.tile(around.starts[:, 1:], (len(around.models), 1)))
 
 
 def test_controllers_together_do_what_each_does_alone() -> None:

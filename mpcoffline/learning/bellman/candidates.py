@@ -42,7 +42,7 @@ def candidates(
     if fixed:
         given = given.replace(horizon=full.horizon, discount=full.discount)
     model = known.found.model if "model" in known.groups else full.model
-    own = given.replace(model=given.model.with_delay(full.model.delay))
+    own = given.replace(model=given.model.with_delay(full.model.delay), applied_before=full.applied_before)
     if known.cost is not None:
         own = own.replace(stage_cost=full.stage_cost)  # with the logged weights, where these were taken over
     plain = own.replace(model=model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -13,17 +14,18 @@ from mpcoffline.core.checks import check_known, check_number
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import fit_residual, with_residual
+from mpcoffline.estimation.beginnings import applied_before
 from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learning.ends import ends_matter, priced_ends
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.potential import Potential
-from mpcoffline.learning.stages import Known, Stage, Training
+from mpcoffline.learning.stages import Known, KnownCost, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.learning.value.training import ValueTraining
-from mpcoffline.mpc import MPC, NormCost, TerminalCost
+from mpcoffline.mpc import MPC, Model, NormCost, TerminalCost
 from mpcoffline.mpc.penalties import paid_in_value, repriced
 
 from .regression import ParameterConfig, ParameterTraining
@@ -86,11 +88,29 @@ def identified(known: Known, config: StartConfig) -> Known:
     tried = ["dead times"] if config.delays and known.value_function is None else []
     rows = as_logged(known.mpc, known.table, known.cost)
     found, table = identify_as_logged(known.mpc, known.table, rows, tried=tried, seed=known.seed, start=known.start)
-    known = replace(known, table=table, found=found)
+    known = replace(known, table=table, found=found, mpc=_begun_as_logged(known, found.model))
     if "model" not in known.groups:
         return known
     known = replace(known, mpc=known.mpc.replace(model=found.model), model_error=found.error_after)
     return completed(known, found.table) if config.residual and found.error_after > config.adapt_above else known
+
+
+def _begun_as_logged(known: Known, model: Model) -> MPC:
+    """The MPC that takes for applied before an episode what the log's episodes say, where nobody has told it."""
+    if known.begun is None or known.mpc.applied_before is not None:
+        return known.mpc
+    cost, costs = known.cost, None
+    if cost is not None and not cost.constant:
+        costs = partial(_unscaled, cost)
+    applied = applied_before(known.mpc.replace(model=model), known.begun, costs)
+    if applied is None:
+        return known.mpc
+    _log.info("Before episodes of the log, inputs of %s were applied, as their first rows say", applied)
+    return known.mpc.replace(applied_before=applied)
+
+
+def _unscaled(cost: KnownCost, rows: TransitionTable) -> Array:
+    return np.asarray((rows.values().costs - cost.offset) / cost.scale)
 
 
 def completed(known: Known, rows: TransitionTable) -> Known:
