@@ -51,7 +51,7 @@ class MPCPolicy(BasePolicy):
 
     Where the MPC's state holds past inputs (dead time, prices on changes), observations stay what they are: the inputs
     that were applied, clipped and with noise, travel in ``state`` beside the plan. Of those before an episode nothing
-    is known; ``mpc.usual_input`` stands for them: as the log's episodes began, else the stage cost's ``u_ref``, or zero.
+    is known; ``mpc.usual_input`` stands for them: as the log's episodes began, else the stage cost's ``u_ref``, or 0.
 
     The policy is also a plain function, ``policy(observations)``: actions alone, by cold solves.
 
