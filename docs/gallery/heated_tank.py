@@ -22,7 +22,7 @@ plant = Plant(
     parameters={
         "exchange": Parameter(0.006, unit="1/s", spread=0.4),
         "flushing": Parameter(0.0003, unit="1/l", spread=0.4),
-        "heating": Parameter(0.0005, unit="K/s", spread=0.4),
+        "heating": Parameter(0.0008, unit="K/s", spread=0.4),
     },
     dynamics=dynamics,
     cost={"tank": 1.0, "heater": 0.001},
