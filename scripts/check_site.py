@@ -84,7 +84,9 @@ def check_links(site: Path) -> int:
             path, anchor = urllib.parse.unquote(parts.path), urllib.parse.unquote(parts.fragment)
             target = posixpath.normpath(posixpath.join(posixpath.dirname(page), path)) if path else page
             there = (site / target).is_file()
-            if not there or (anchor and anchor not in anchors.get(target, ())):
+            # Sphinx links a source's objects all by the name that one of them has: the page is right, not each anchor.
+            loose = page.startswith("_modules/") and not target.startswith("_modules/")
+            if not there or (anchor and not loose and anchor not in anchors.get(target, ())):
                 broken.append(f"{page}: {link}")
     print("\n".join(sorted(set(broken))), file=sys.stderr, end="\n" if broken else "")
     print(f"{seen} links within {len(texts)} pages, {len(broken)} broken")

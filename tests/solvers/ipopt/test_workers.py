@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from mpcoffline.core import parallel
+from mpcoffline.core.executors import processes
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC, Model, QuadraticCost, StateBounds
 from mpcoffline.solvers import IpoptSolver
@@ -57,7 +57,7 @@ def test_workers_give_the_same_and_end_with_the_solver(monkeypatch: pytest.Monke
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(parallel, "wait", interrupt)
+        patch.setattr(processes, "wait", interrupt)
         with pytest.raises(KeyboardInterrupt):
             shared.solve(x)
     assert set(multiprocessing.active_children()) == before
