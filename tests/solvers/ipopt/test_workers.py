@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from mpcoffline.core.executors import processes
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.executors import processes
 from mpcoffline.mpc import MPC, Model, QuadraticCost, StateBounds
 from mpcoffline.solvers import IpoptSolver
 
