@@ -118,7 +118,7 @@ def _exchanges(nx: int, nu: int, named: list[str]) -> Iterator[Guess]:
     for a, b in combinations(range(nu), 2):
 
         def read_inputs(r: Reading, a: int = a, b: int = b) -> Reading:
-            order = list(range(nu))
+            order = list(range(r.u.shape[1]))  # signals stay
             order[a], order[b] = b, a
             return r._replace(u=r.u[:, order])
 

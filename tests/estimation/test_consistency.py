@@ -299,3 +299,23 @@ def test_signals_are_no_states() -> None:
 )
 def test_logs_with_signals_are_read_otherwise_too(log: dict[str, Any], words: str) -> None:
     assert words in str(mpcoffline.check(room_mpc(200.0, 400.0), room_log(**log)))
+
+
+def test_exchanged_inputs_beside_a_signal_are_named() -> None:
+    """A reading of several inputs leaves the signals where they are."""
+
+    def step(x: ca.SX, u: ca.SX, p: dict[str, ca.SX], d: Any) -> ca.SX:
+        return ca.vertcat(0.9 * x[0] + p["heat"] * u[0] + 0.3 * d.load, 0.8 * x[1] - p["cool"] * u[1] + 0.1 * x[0])
+
+    gains = {"heat": Parameter(0.5, low=0.3, high=0.9), "cool": Parameter(0.2, low=0.1, high=0.4)}
+    model = Model(step, 2, 2, 60.0, gains, discrete=True, signals=[Signal("load")])
+    mpc = MPC(model, QuadraticCost(np.eye(2), np.eye(2)), QuadraticCost(np.eye(2)), 20, 0.95, [-1.0] * 2, [1.0] * 2)
+    rng = np.random.default_rng(0)
+    y, u = np.hstack([rng.normal(size=(600, 2)), rng.normal(size=(600, 1))]), rng.uniform(-1.0, 1.0, (600, 2))
+    heated = 0.9 * y[:, 0] + 0.5 * u[:, 0] + 0.3 * y[:, 2]
+    reached = np.column_stack([heated, 0.8 * y[:, 1] - 0.2 * u[:, 1] + 0.1 * y[:, 0], rng.normal(size=600)])
+    cost = (y[:, :2] ** 2).sum(axis=1) + (u**2).sum(axis=1)
+    table = TransitionTable.from_arrays(y, u, cost, reached, np.zeros(600), np.arange(600))
+    exchanged = TransitionTable.from_arrays(y, u[:, ::-1], cost, reached, np.zeros(600), np.arange(600))
+    assert "exchanged" not in str(mpcoffline.check(mpc, table))
+    assert "actions 0 and 1 are exchanged" in str(mpcoffline.check(mpc, exchanged))
