@@ -209,6 +209,8 @@ def _nothing_better(trials: Trials) -> str:
     tried = [Difference.of(trials, name, trials.names[0]) for name in others]
     if not tried:
         return f"{trials.names[0]} is the only candidate."
+    if not trials.votes.any():  # in the choice; of other models some have one here
+        return NO_MODEL_PREDICTS
     best = min(tried, key=lambda each: np.nan_to_num(each.mean[each.middle], nan=np.inf))
     k, n = best.middle, int(starts_of(trials, best.name).sum())
     gain = f"{_size(best, k)} {'less' if best.mean[k] < 0.0 else 'more'} an episode"

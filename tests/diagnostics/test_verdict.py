@@ -95,6 +95,10 @@ def test_a_learner_that_hands_out_mpc_1_says_what_the_best_other_was() -> None:
     assert found == "keep MPC_1"
     assert "the best of 2 candidates, identified" in why
     assert judge(trials({"V": BETTER}, clone=50.0, today=50.0), "MPC_1")[0] == "keep MPC_1"
+    unasked = trials({"V": BETTER}, votes=[False] * 5)
+    found, why = judge(trials({"V": BETTER}), "MPC_1", choice=unasked)
+    assert found == "keep MPC_1"
+    assert "No model of the log predicts it" in why
 
 
 def test_only_starts_without_a_part_in_the_choice_judge() -> None:
