@@ -191,7 +191,7 @@ def with_ending(path: str | PathLike[str]) -> Path:
     """The file of a name that may have been given without its ``.zip``."""
     file = Path(path)
     longer = file.with_name(f"{file.name}.zip")
-    return longer if not file.suffix and not file.exists() else file
+    return longer if not file.suffix and not file.exists() and longer.exists() else file
 
 
 def holds(path: str | PathLike[str], kind: str) -> bool:

@@ -208,7 +208,9 @@ class MPCModel(BaseAlgorithm):
         """
         if print_system_info:
             get_system_info()
-        return cls(MPCPolicy.load(path), env, verbose=verbose, seed=seed)
+        file = Path(path)
+        policy = MPCPolicy.load(file if file.exists() else _with_suffix(file))  # SB3 says which file it did not find
+        return cls(policy, env, verbose=verbose, seed=seed)
 
 
 def _with_suffix(path: Path) -> Path:
