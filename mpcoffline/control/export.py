@@ -136,6 +136,7 @@ def _source(mpc: MPC, solver: DDPSolver) -> str:
         _array("low", mpc.action_low),
         _array("high", mpc.action_high),
         _array("unit", input_units(mpc)),
+        _array("rest", mpc.usual_input),
         _array("candidates", segments),
         "/* What counts as applied before the first step; where each past input comes from: past inputs, then u. */",
         _array("usual", np.append(mpc.layout.filled(mpc.usual_input), 0.0)),
@@ -247,8 +248,9 @@ _HEADER = """\
  * returned, so apply them as they are.
  *
  * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
- * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, and MPC_MAX_ITERATIONS + 4
- * for a quarter of them, rounded up. An iteration costs the same each time, up to the 10 trial steps of its line
+ * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, MPC_MAX_ITERATIONS + 4 for a
+ * quarter of them, rounded up, and MPC_MAX_ITERATIONS for a plan that stays where the plant is. An iteration costs the
+ * same each time, up to the 10 trial steps of its line
  * search.
  */
 #ifndef MPC_CONTROLLER_H

@@ -205,12 +205,13 @@ _MAIN = """
 #define N {horizon}
 #define B {n}
 static const double x0[] = {{{x}}}, candidates[] = {{{candidates}}}, theta[] = {{{theta}}};
-static const double low[] = {{{low}}}, high[] = {{{high}}}, unit[] = {{{unit}}};
+static const double low[] = {{{low}}}, high[] = {{{high}}};
+static const double unit[] = {{{unit}}}, rest[] = {{{rest}}};
 static double x[B * (N + 1) * NX], u[B * N * NU], J[B], predicted[B], y[B * MULTIPLIER_ROWS(N) * LIMITS];
 static double violation[B], now[B], amount[B];
 static int64_t iterations[B], status[B], worst[B];
 int main(void) {{
-    mpc_problem m = {{N, {discount}, low, high, unit, 60, 1e-11, 0}};
+    mpc_problem m = {{N, {discount}, low, high, unit, rest, 60, 1e-11, 0}};
     mpc_batch b = {{.n = B, .x0 = x0, .theta = theta, .x = x, .u = u, .J = J, .predicted = predicted}};
     b.iterations = iterations, b.status = status, b.limits = y, b.violation = violation, b.now = now, b.worst = worst;
     b.amount = amount;
@@ -248,6 +249,7 @@ def sanitized(mpc: MPC, x: Array, folder: Path) -> tuple[NDArray[np.int64], Arra
         low=numbers(mpc.action_low),
         high=numbers(mpc.action_high),
         unit=numbers(np.ones(mpc.nu)),
+        rest=numbers(mpc.usual_input),
         discount=mpc.discount,
     )
     flags = [flag for flag in flags_of("clang") if flag not in ("-O3", "-shared", "-fPIC")]

@@ -122,9 +122,16 @@ static void start(const mpc_problem *m, mpc_state *state, lanes *w, int c) {
     if (!(w->J < INFINITY)) w->J = INFINITY;
 }
 
+/* A plan that stays where the plant is, and need not obey the model. */
+static void stay(const mpc_problem *m, lanes *w) {
+    for (int i = 0; i < (MPC_HORIZON + 1) * NX; ++i) w->x[i] = w->s[i % NX];
+    for (int i = 0; i < MPC_HORIZON * NU; ++i) w->u[i] = m->rest[i % NU];
+    w->J = w->size = INFINITY;
+}
+
 /* Solves from MPC_STARTS starts, each the cheapest of its share of the candidates: a few iterations each, the best go
- * on (they are run again, which needs less memory than keeping all), the best plan is kept, and its cost is w->J. Returns
- * its state; NOT_FINITE if there is none. */
+ * on (they are run again, which needs less memory than keeping all), beside a plan that stays, the best plan is kept, and
+ * its cost is w->J. Returns its state; NOT_FINITE if there is none. */
 static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     double J[N_CANDIDATES], raced[MPC_STARTS], best = INFINITY;
     int cheapest[MPC_STARTS], best_status = NOT_FINITE;
@@ -147,8 +154,9 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
         raced[l] = w->J;
     }
     choose_finalists(raced, MPC_STARTS, chosen);
-    for (int l = 0; l < FINALISTS(MPC_STARTS); ++l) {
-        start(m, state, w, cheapest[chosen[l]]);
+    for (int l = 0; l < FINALISTS(MPC_STARTS) + (MPC_STARTS > 1); ++l) {
+        if (l < FINALISTS(MPC_STARTS)) start(m, state, w, cheapest[chosen[l]]);
+        else stay(m, w);
 #if LIMITS
         load_limits(m, state, w, FIRST_TOLERANCE);
 #endif
@@ -265,9 +273,9 @@ static int pause_of(const double *x, const double *u, const double *p) {
 
 int mpc_step(const mpc_parameters *parameters, mpc_state *state, const double y[MPC_NY], double u[MPC_NU]) {
 #if LIMITS
-    const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, MPC_MAX_ITERATIONS, TOLERANCE, 0};
+    const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, rest, MPC_MAX_ITERATIONS, TOLERANCE, 0};
 #else
-    const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, MPC_MAX_ITERATIONS, TOLERANCE};
+    const mpc_problem problem = {MPC_HORIZON, DISCOUNT, low, high, unit, rest, MPC_MAX_ITERATIONS, TOLERANCE};
 #endif
     const double *theta = (const double *)parameters;
     lanes w;

@@ -56,6 +56,7 @@ typedef struct {
     double discount;
     const double *low, *high; /* (NU) */
     const double *unit;       /* (NU): sizes of the inputs against each other */
+    const double *rest;       /* (NU): the inputs of a plan that stays where it is */
     int64_t max_iterations;
     double tolerance;         /* on the predicted decrease, relative to the sum of the magnitudes of the costs */
 #if LIMITS

@@ -50,6 +50,7 @@ typedef struct {
     int guess;                       /* PLAN, INPUTS, or ROLLOUT */
     const double *x_guess, *u_guess; /* as x, u, and may be these */
     int rivals;                      /* these are starts of one problem, of which only the best solution matters */
+    int stays;                       /* the last one is a PLAN, whatever the others are */
 #if LIMITS
     const double *limits_guess;     /* (n, N+4, LIMITS), or one for all: see MULTIPLIER_ROWS */
     int64_t limits_stride;          /* (N+4) LIMITS, or 0 */
@@ -59,6 +60,9 @@ typedef struct {
     double *amount;                 /* (n): of the worst, in its own unit */
 #endif
 } mpc_batch;
+
+/* Whether x_guess of a problem need not obey the model, and nothing is known of what it costs. */
+static int is_plan(const mpc_batch *b, int64_t i) { return b->guess == PLAN || (b->stays && i == b->n - 1); }
 
 /* One theta for all lanes. */
 static void load_theta(lanes *w, const double *theta) {
@@ -116,11 +120,12 @@ static void load_lane(const mpc_problem *m, const mpc_batch *b, lanes *w, int la
         }
         if (b->u0) w->u[a][lane] = b->u0[i * NU + a];
     }
-    if (b->guess != INPUTS)
+    int plan = is_plan(b, i), known = b->guess == ROLLOUT && !plan;
+    if (plan || known)
         for (int64_t k = 0; k < (N + 1) * NX; ++k) w->x[k][lane] = b->x_guess[i * (N + 1) * NX + k];
     for (int j = 0; j < NX; ++j) w->x[j][lane] = w->s[j][lane];
-    w->J[lane] = b->guess == ROLLOUT ? b->J[i] : INFINITY;
-    w->size[lane] = b->guess == ROLLOUT ? b->size[i] : INFINITY;
+    w->J[lane] = known ? b->J[i] : INFINITY;
+    w->size[lane] = known ? b->size[i] : INFINITY;
     w->mu[lane] = w->alpha[lane] = 0.0;
 #if LIMITS
     load_limits(m, b, w, lane, i);
@@ -203,14 +208,14 @@ static void solve_range(const mpc_problem *m, const mpc_batch *b, lanes *w, int6
         if (first < b->n) load_lane(m, b, w, l, first); /* lanes that get nothing to do repeat this one, ignored */
     }
     for (;;) {
-        vl fresh = no_lanes();
+        vl fresh = no_lanes(); /* lanes whose inputs have to be rolled out first */
         fresh_any = busy = 0;
         for (int l = 0; l < LANES; ++l) {
             if (problem[l] < 0 && next < b->n) {
                 load_lane(m, b, w, l, problem[l] = next);
                 next += stride;
                 count[l] = 0;
-                fresh[l] = -1;
+                fresh[l] = -!is_plan(b, problem[l]);
                 fresh_any = 1;
             }
             busy |= problem[l] >= 0;
@@ -381,6 +386,16 @@ static void race(const mpc_problem *m, mpc_batch *starts, lanes *w, int64_t *cho
     }
 }
 
+/* Makes the last of the finalists a plan that stays at x0. Where the plant is unstable, all input sequences lead far away,
+ * and there they end in minima of their own; along this plan the first backward pass finds a feedback that holds it. */
+static void stay(const mpc_problem *m, const mpc_batch *b, int64_t i, mpc_batch *finals) {
+    int64_t N = m->horizon, last = finals->n++;
+    double *x = finals->x + last * (N + 1) * NX, *u = finals->u + last * N * NU;
+    for (int64_t k = 0; k < (N + 1) * NX; ++k) x[k] = b->x0[i * NX + k % NX];
+    for (int64_t k = 0; k < N * NU; ++k) u[k] = m->rest[k % NU];
+    finals->stays = 1;
+}
+
 /* Cold solve of one problem; the best solution goes to row i of the batch. */
 static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, const double *candidates,
                        int64_t n_candidates, double *J, lanes *w, mpc_batch *starts, int64_t *chosen) {
@@ -396,6 +411,7 @@ static void solve_cold(const mpc_problem *m, const mpc_batch *b, int64_t i, cons
         finals.n = FINALISTS(starts->n);
         finals.guess = LIMITS ? INPUTS : ROLLOUT; /* with limits a rollout is more than its states and costs */
         finals.rivals = 1;
+        stay(m, b, i, &finals); /* FINALISTS(n) < n: there is a row for it */
     }
     solve_range(m, &finals, w, 0, 1);
     for (int64_t l = 0; l < finals.n; ++l) {

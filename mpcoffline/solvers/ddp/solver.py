@@ -42,6 +42,7 @@ class _Problem(ctypes.Structure):
         ("low", c_void_p),
         ("high", c_void_p),
         ("unit", c_void_p),
+        ("rest", c_void_p),
         ("max_iterations", c_int64),
         ("tolerance", c_double),
         ("race", c_int),  # with limits only
@@ -68,6 +69,7 @@ class _Batch(ctypes.Structure):
         ("x_guess", c_void_p),
         ("u_guess", c_void_p),
         ("rivals", c_int),
+        ("stays", c_int),
         ("limits_guess", c_void_p),  # from here on with limits only
         ("limits_stride", c_int64),
         ("limits", c_void_p),
@@ -91,8 +93,9 @@ class DDPSolver(Solver):
     the model is large (a network).
 
     A cold problem is solved from 16 of 64 fixed input sequences, each the cheapest of four that are alike; the best
-    four of different costs go on after three iterations, and the best solution is kept. A warm one is solved from its
-    plan, which need not obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
+    four of different costs go on after three iterations, beside a plan that stays where the plant is (an unstable one
+    is led far away by all sequences), and the best solution is kept. A warm one is solved from its plan, which need not
+    obey the model. Every result is a rollout of the model, so the dynamics hold exactly;
     ``success`` says that the quadratic model at it promises no further decrease and that the first input has settled.
     Otherwise it is the best plan found, and ``status`` says why it was not accepted: ``"iteration limit"``,
     ``"stalled"`` (no step lowers the cost, though the quadratic model promises one), ``"infeasible"`` (a hard limit
@@ -139,14 +142,8 @@ class DDPSolver(Solver):
         n_threads: int = 1,
         round_corners: bool = True,
     ) -> None:
-        super().__init__(
-            mpc,
-            max_iterations=max_iterations,
-            tolerance=tolerance,
-            n_starts=n_starts,
-            n_threads=n_threads,
-            round_corners=round_corners,
-        )
+        options: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance, "n_starts": n_starts}
+        super().__init__(mpc, **options, n_threads=n_threads, round_corners=round_corners)
         if max_iterations is None:
             max_iterations = _ITERATIONS if mpc.constraints is None else _LIMITED_ITERATIONS
         check_options({"max_iterations": max_iterations, "tolerance": tolerance, "n_threads": n_threads})
@@ -155,18 +152,19 @@ class DDPSolver(Solver):
         if not 1 <= n_starts <= N_CANDIDATES:
             raise InvalidArgumentError("n_starts", expected=f"from 1 to {N_CANDIDATES}", actual=str(n_starts))
         library = compiled(source(mpc))
-        problem, batch = POINTER(_Problem), POINTER(_Batch)
-        library.mpc_solve.argtypes = (problem, batch, c_int64, c_int64)
-        library.mpc_solve_cold.argtypes = (problem, batch, c_void_p, c_int64, c_int64, c_int64, c_int64)
+        problem, batch, number = POINTER(_Problem), POINTER(_Batch), c_int64
+        library.mpc_solve.argtypes = (problem, batch, number, number)
+        library.mpc_solve_cold.argtypes = (problem, batch, c_void_p, number, number, number, number)
         self._library = library
         self._low, self._high = (np.ascontiguousarray(b, dtype=np.float64) for b in (mpc.action_low, mpc.action_high))
-        self._unit = input_units(mpc)
+        self._unit, self._rest = input_units(mpc), np.ascontiguousarray(mpc.usual_input)
         self._problem = _Problem(
             mpc.horizon,
             mpc.discount,
             self._low.ctypes.data,
             self._high.ctypes.data,
             self._unit.ctypes.data,
+            self._rest.ctypes.data,
             max_iterations,
             tolerance,
         )

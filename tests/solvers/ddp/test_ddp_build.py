@@ -205,7 +205,7 @@ int main(void) {
     static const double given[] = {THETA};
     for (int a = 0; a < NU; ++a) { low[a] = -0.5 - 0.1 * a; high[a] = 0.7; unit[a] = 1.0 + a; }
     for (int k = 0; k < M * N * NU; ++k) candidates[k] = 0.5 * uniform();
-    mpc_problem problem = {N, 0.95, low, high, unit, 50, 1e-10};
+    mpc_problem problem = {N, 0.95, low, high, unit, low, 50, 1e-10};
     int solved = 0;
     for (int round = 0; round < 4; ++round) {
         double size = round < 3 ? 2.0 : 1e200;
