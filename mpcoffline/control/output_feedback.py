@@ -14,11 +14,11 @@ from stable_baselines3.common.policies import BasePolicy
 from mpcoffline.core.archive import file_errors, read_archive, with_ending, write_archive
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.estimation.observer import Estimate, KalmanObserver
 from mpcoffline.mpc.expressions import function_from_json, function_to_json
 
 from .course import Course, course_from
 from .observations import checked_observation
-from .observer import Estimate, KalmanObserver
 from .policy import MPCPolicy
 
 _OWN = 3  # arrays of the state that are the observer's: estimates, covariances, what acts; and of a course
@@ -84,7 +84,7 @@ class OutputFeedbackPolicy(BasePolicy):
             deterministic: Whether to act without exploration noise.
 
         Returns:
-            Actions ``(nu,)`` or ``(B, nu)`` as :meth:`MPCPolicy.predict` does; and estimates ``(B, n)``, covariances
+            Actions ``(nu,)`` or ``(B, nu)`` as :meth:`mpcoffline.MPCPolicy.predict` does; and estimates ``(B, n)``, covariances
             ``(B, n, n)``, what acts ``(B, nu + n_signals)``, and the MPC's own state.
 
         Raises:
@@ -146,7 +146,7 @@ class OutputFeedbackPolicy(BasePolicy):
         """Writes policy and observer to a zip of JSON (no pickle).
 
         Raises:
-            InvalidArgumentError: As :meth:`MPCPolicy.save`; or for outputs that are no plain arithmetic.
+            InvalidArgumentError: As :meth:`mpcoffline.MPCPolicy.save`; or for outputs that are no plain arithmetic.
         """
         observer = self.observer
         disturbance = None if observer.disturbance is None else observer.disturbance.tolist()
@@ -156,7 +156,7 @@ class OutputFeedbackPolicy(BasePolicy):
 
     @classmethod
     def load(cls, path: str | PathLike[str], device: torch.device | str = "auto", **solver_options: Any) -> Self:
-        """Reads what :meth:`save` wrote; see :meth:`MPCPolicy.load`.
+        """Reads what :meth:`save` wrote; see :meth:`mpcoffline.MPCPolicy.load`.
 
         Raises:
             FileFormatError: If the file is damaged, foreign or of another version.

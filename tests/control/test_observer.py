@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from mpcoffline import MPC, MPCPolicy, evaluate
-from mpcoffline.control.observer import KalmanObserver
 from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
+from mpcoffline.estimation.observer import KalmanObserver
 from mpcoffline.mpc import Model, QuadraticCost, Signal
 
 Array = NDArray[np.float64]

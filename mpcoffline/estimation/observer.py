@@ -35,6 +35,74 @@ class Estimate(NamedTuple):
     P: Array
 
 
+class OutputModel:
+    """What an MPC's model says of outputs: the plant's map with constant disturbances of its inputs, and h.
+
+    Args:
+        mpc: Has the model.
+        outputs: Which states are measured, or a function of them.
+        n_disturbances: Of the first inputs, those with a disturbance.
+
+    Attributes:
+        function: h, x ``(n_states, 1)`` -> y.
+        n_outputs: Number of outputs.
+
+    Raises:
+        InvalidArgumentError: For outputs that are none of the states, or no expression.
+    """
+
+    def __init__(self, mpc: MPC, outputs: Outputs, n_disturbances: int = 0) -> None:
+        n, m = mpc.layout.n_states, n_disturbances
+        self.function = _outputs(outputs, n)
+        self.n_outputs = self.function.numel_out(0)
+        z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
+        theta = ca.SX.sym("theta", mpc.space.size)
+        disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
+        ahead, seen = ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:]), self.function(z[:n])
+        self._ahead = ca.Function("ahead", [z, acting, theta], [ahead, ca.densify(ca.jacobian(ahead, z))])
+        self._seen = ca.Function("seen", [z], [seen, ca.densify(ca.jacobian(seen, z))])
+        self._identity = np.eye(n + m)
+
+    def ahead(self, known: Estimate, acting: Array, theta: Array, Q: Array) -> tuple[Estimate, Array]:
+        """What is known a step later, before an output, and F ``(B, n, n)``.
+
+        A prediction that is no number leaves the states where they are, as uncertain as they would be then.
+
+        Args:
+            known: At the step.
+            acting: The inputs that act in it, and the present signals, ``(B, nu + n_signals)``.
+            theta: Parameters, ``(size,)``, or ``(B, size)``.
+            Q: Covariance of what the model misses, ``(n, n)`` or ``(B, n, n)``.
+        """
+        x, F = _called(self._ahead, known.x, acting, theta)
+        failed = ~(np.isfinite(x).all(axis=1) & np.isfinite(F).all(axis=(1, 2)))
+        if failed.any():
+            x[failed], F[failed] = known.x[failed], self._identity
+        return Estimate(x, F @ known.P @ F.swapaxes(1, 2) + Q), F
+
+    def corrected(self, known: Estimate, y: Array, R: Array) -> tuple[Estimate, Array, Array]:
+        """What is known with outputs y ``(B, n_outputs)``, the innovations, and their covariance S.
+
+        Outputs that are NaN are not there: their innovation is zero, and S that of the noise alone.
+
+        Args:
+            known: Before them.
+            y: The outputs.
+            R: Covariance of their noise, ``(n_outputs, n_outputs)`` or ``(B, n_outputs, n_outputs)``.
+        """
+        seen, H = _called(self._seen, known.x)
+        missing = ~np.isfinite(y)
+        innovation = y - seen
+        if missing.any():
+            innovation, H = np.where(missing, 0.0, innovation), np.where(missing[:, :, None], 0.0, H)
+        HP = H @ known.P
+        S = HP @ H.swapaxes(1, 2) + R
+        gain = np.linalg.solve(S, HP).swapaxes(1, 2)
+        left = self._identity - gain @ H
+        P = left @ known.P @ left.swapaxes(1, 2) + gain @ R @ gain.swapaxes(1, 2)
+        return Estimate(known.x + (gain @ innovation[:, :, None])[:, :, 0], P), innovation, S
+
+
 class KalmanObserver:
     """An extended Kalman filter: estimates the plant's states from what sensors show of them.
 
@@ -64,7 +132,7 @@ class KalmanObserver:
 
     Raises:
         InvalidArgumentError: For numbers that are negative, of another size or not finite, outputs that are none of the
-            states, noise of zero, more disturbances than outputs, or states that no output tells apart at the start.
+            states, noise of zero, or more disturbances than outputs.
     """
 
     def __init__(
@@ -79,14 +147,14 @@ class KalmanObserver:
         disturbance: ArrayLike | None = None,
     ) -> None:
         n = mpc.layout.n_states
-        self.mpc, self.function = mpc, _outputs(outputs, n)
-        self.n_outputs = self.function.numel_out(0)
+        self.mpc, self.n_disturbances = mpc, 0 if disturbance is None else mpc.nu
+        self._model = OutputModel(mpc, outputs, self.n_disturbances)
+        self.function, self.n_outputs, self._theta = self._model.function, self._model.n_outputs, mpc.theta
         self.noise = _spreads("noise", noise, self.n_outputs, positive=True)
         self.process = _spreads("process", process, n)
         self.start = at_rest(mpc)[:n] if start is None else _vector("start", start, n)
         self.start_spread = _spreads("start_spread", start_spread, n)
         self.disturbance = None if disturbance is None else _spreads("disturbance", disturbance, mpc.nu)
-        self.n_disturbances = 0 if self.disturbance is None else mpc.nu
         if self.n_disturbances > self.n_outputs:
             raise InvalidArgumentError(
                 "disturbance",
@@ -94,18 +162,8 @@ class KalmanObserver:
                 actual=f"{self.n_disturbances} inputs",
                 hint="More cannot be told apart. disturbance=None leaves them out.",
             )
-        self._build()
-
-    def _build(self) -> None:
-        mpc, n, m = self.mpc, self.mpc.layout.n_states, self.n_disturbances
-        z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
-        disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
-        ahead = ca.vertcat(mpc.plant_function(z[:n], disturbed, mpc.theta), z[n:])
-        seen = self.function(z[:n])
-        self._ahead = ca.Function("ahead", [z, acting], [ahead, ca.densify(ca.jacobian(ahead, z))])
-        self._seen = ca.Function("seen", [z], [seen, ca.densify(ca.jacobian(seen, z))])
-        self._Q = np.diag(np.concatenate([self.process, self.disturbance if m else []]) ** 2)
-        self._R, self._identity = np.diag(self.noise**2), np.eye(n + m)
+        missed = self.process if self.disturbance is None else np.append(self.process, self.disturbance)
+        self._Q, self._R = np.diag(missed**2), np.diag(self.noise**2)
 
     def begin(self, n_loops: int) -> Estimate:
         """What is known before the first output of B loops."""
@@ -120,31 +178,16 @@ class KalmanObserver:
     def ahead(self, known: Estimate, acting: Array) -> Estimate:
         """What is known a step later, before an output.
 
-        A prediction that is no number leaves the states where they are, as uncertain as they would be then.
-
         Args:
             known: At the step.
             acting: The inputs that act in it, dead time past, and the present signals, as ``mpc.layout.split`` gives
                 them, ``(B, nu + n_signals)``.
         """
-        x, F = _called(self._ahead, known.x, acting)
-        failed = ~(np.isfinite(x).all(axis=1) & np.isfinite(F).all(axis=(1, 2)))
-        if failed.any():
-            x[failed], F[failed] = known.x[failed], self._identity
-        return Estimate(x, F @ known.P @ F.swapaxes(1, 2) + self._Q)
+        return self._model.ahead(known, acting, self._theta, self._Q)[0]
 
     def corrected(self, known: Estimate, y: Array) -> Estimate:
         """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there."""
-        seen, H = _called(self._seen, known.x)
-        missing = ~np.isfinite(y)
-        innovation, R = y - seen, self._R
-        if missing.any():
-            innovation, H = np.where(missing, 0.0, innovation), np.where(missing[:, :, None], 0.0, H)
-        HP = H @ known.P
-        gain = np.linalg.solve(HP @ H.swapaxes(1, 2) + R, HP).swapaxes(1, 2)
-        left = self._identity - gain @ H
-        P = left @ known.P @ left.swapaxes(1, 2) + gain @ R @ gain.swapaxes(1, 2)
-        return Estimate(known.x + (gain @ innovation[:, :, None])[:, :, 0], P)
+        return self._model.corrected(known, y, self._R)[0]
 
     def states(self, known: Estimate) -> Array:
         """The plant's states, ``(B, n_states)``."""
@@ -169,7 +212,7 @@ def _outputs(outputs: Outputs, n: int) -> ca.Function:
 
 def _called(function: ca.Function, *arguments: Array) -> tuple[Array, Array]:
     """A function of columns and its Jacobian at rows of arguments ``(B, ...)``: ``(B, m)`` and ``(B, m, n)``."""
-    value, slopes = function(*(argument.T for argument in arguments))
+    value, slopes = function(*(argument.T if argument.ndim > 1 else argument for argument in arguments))
     m, B = value.shape
     return np.array(value.full().T), np.array(slopes.full().reshape(m, B, -1).swapaxes(0, 1))
 
