@@ -84,8 +84,8 @@ class OutputFeedbackPolicy(BasePolicy):
             deterministic: Whether to act without exploration noise.
 
         Returns:
-            Actions ``(nu,)`` or ``(B, nu)`` as :meth:`mpcoffline.MPCPolicy.predict` does; and estimates ``(B, n)``, covariances
-            ``(B, n, n)``, what acts ``(B, nu + n_signals)``, and the MPC's own state.
+            Actions ``(nu,)`` or ``(B, nu)`` as :meth:`mpcoffline.MPCPolicy.predict` does; and estimates ``(B, n)``,
+            covariances ``(B, n, n)``, what acts ``(B, nu + n_signals)``, and the MPC's own state.
 
         Raises:
             InvalidArgumentError: For an observation of the wrong shape, or a state of another policy or batch size.

@@ -50,7 +50,7 @@ class OutputEpisodes(NamedTuple):
     rows: NDArray[np.intp]
 
     def some(self, rows: int, longest: int, seed: int) -> OutputEpisodes:
-        """Beginnings of episodes picked at random, about this many rows, of so many steps at most where these suffice."""
+        """Beginnings of random episodes, about this many rows, of so many steps at most where these suffice."""
         order = np.random.default_rng(seed).permutation(len(self.lengths))
         longest = max(longest, rows // len(order))
         lengths = np.minimum(self.lengths, longest)
