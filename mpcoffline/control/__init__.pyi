@@ -2,5 +2,6 @@
 
 from .evaluation import evaluate as evaluate
 from .export import export_c as export_c
+from .output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .policy import MPCPolicy as MPCPolicy
 from .predictors import D3rlpyPredictor as D3rlpyPredictor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Mapping
 from os import PathLike
 from typing import Any, Self, cast
 
@@ -33,6 +34,7 @@ from mpcoffline.solvers.fallback import Fallback, SolverStats
 from mpcoffline.solvers.options import OF_THE_MACHINE
 
 from .course import Course, course_from
+from .observations import checked_observation
 
 logger = logging.getLogger(__name__)
 
@@ -234,7 +236,7 @@ class MPCPolicy(BasePolicy):
             InvalidArgumentError: For an observation of the wrong shape or with NaN, a state of another batch size, or
                 noise where actions are unbounded.
         """
-        given = self._checked_observation(observation)
+        given = checked_observation(observation, self.mpc.ny)
         observations = np.atleast_2d(given)
         if self._vec_normalize is not None:
             observations = self._unnormalized(observations, self._vec_normalize)
@@ -273,32 +275,6 @@ class MPCPolicy(BasePolicy):
         assert isinstance(self.action_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
         return self.action_space
 
-    def _checked_observation(self, observation: ArrayLike | dict[str, NDArray[Any]]) -> NDArray[np.float64]:
-        ny = self.mpc.ny
-        expected = f"shape ({ny},) or (B, {ny})"
-        try:
-            array = np.asarray(cast(ArrayLike, observation), dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InvalidArgumentError(
-                "observation",
-                expected=f"an array of {expected}",
-                actual=f"{type(observation).__name__}: {error}",
-                hint="Gymnasium's reset() returns observation and info, a VecEnv's the observations alone.",
-            ) from error
-        if array.ndim not in (1, 2) or array.shape[-1] != ny or not array.size:
-            raise InvalidArgumentError(
-                "observation",
-                expected=expected,
-                actual=f"shape {array.shape}",
-                hint="Is the policy used in the environment that its MPC models?",
-            )
-        if not np.isfinite(array).all():
-            first = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
-            raise InvalidArgumentError(
-                "observation", expected="finite numbers", actual=f"{array[first]} at index {list(first)} of {array}"
-            )
-        return array
-
     def _unnormalized(self, observations: NDArray[np.float64], vec_env: VecNormalize) -> NDArray[np.float64]:
         """Observations in their units."""
         if not vec_env.norm_obs:
@@ -329,6 +305,10 @@ class MPCPolicy(BasePolicy):
             InvalidArgumentError: For a solver of a class that is not registered, which no file can name, or an MPC that
                 has no JSON form; nothing is written then.
         """
+        write_archive(path, "policy", self.to_document())
+
+    def to_document(self) -> dict[str, Any]:
+        """What :meth:`save` writes, JSON-able; raises as that."""
         if self.solver_name != "auto" and self.solver_name not in SOLVERS:
             raise InvalidArgumentError(
                 "solver",
@@ -338,7 +318,7 @@ class MPCPolicy(BasePolicy):
             )
         observation_space = self.observation_space
         assert isinstance(observation_space, spaces.Box)  # noqa: S101 -- refused in __init__; narrows the type
-        document = {
+        return {
             "mpc": self.mpc.to_json(),
             "solver": self.solver_name,
             "solver_options": plain({k: v for k, v in self.solver_options.items() if k not in OF_THE_MACHINE}),
@@ -349,7 +329,6 @@ class MPCPolicy(BasePolicy):
             "observation_space": box_to_json(observation_space),
             "action_space": box_to_json(self._action_box),
         }
-        write_archive(path, "policy", document)
 
     @classmethod
     def load(cls, path: str | PathLike[str], device: torch.device | str = "auto", **solver_options: Any) -> Self:
@@ -370,23 +349,38 @@ class MPCPolicy(BasePolicy):
             return cls._of_learner(path, solver_options)
         document, _ = read_archive(path, "policy")
         with file_errors(path):
-            options, solver = dict(document["solver_options"]), document["solver"]
-            if foreign := OF_THE_MACHINE & options.keys():
-                raise FileFormatError("solver_options", expected="none of the machine", actual=", ".join(foreign))
-            check_solver(solver, options)
-        check_solver(solver, options | solver_options)
-        with file_errors(path):
-            return cls(
-                MPC.from_json(document["mpc"]),
-                solver,
-                observation_space=box_from_json(document["observation_space"]),
-                action_space=box_from_json(document["action_space"]),
-                exploration_noise=document.get("exploration_noise", 0.1),
-                seed=document.get("seed", 0),
-                rescue=document.get("rescue"),
-                rescue_time=document.get("rescue_time", 1.0),
-                **(options | solver_options),
-            )
+            policy = cls.of_document(document)
+        policy.use_options(solver_options)
+        return policy
+
+    def use_options(self, solver_options: Mapping[str, Any]) -> None:
+        """Has options of the solver go before its own; raises :class:`InvalidArgumentError` for one that it has not."""
+        check_solver(self.solver_name, self.solver_options | dict(solver_options))
+        self.solver_options |= solver_options
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> Self:
+        """The inverse of :meth:`to_document`.
+
+        Raises:
+            FileFormatError: For options that no file has.
+            InvalidArgumentError: For an option that the solver has not.
+        """
+        options, solver = dict(document["solver_options"]), document["solver"]
+        if foreign := OF_THE_MACHINE & options.keys():
+            raise FileFormatError("solver_options", expected="none of the machine", actual=", ".join(foreign))
+        check_solver(solver, options)
+        return cls(
+            MPC.from_json(document["mpc"]),
+            solver,
+            observation_space=box_from_json(document["observation_space"]),
+            action_space=box_from_json(document["action_space"]),
+            exploration_noise=document.get("exploration_noise", 0.1),
+            seed=document.get("seed", 0),
+            rescue=document.get("rescue"),
+            rescue_time=document.get("rescue_time", 1.0),
+            **options,
+        )
 
     @classmethod
     def _of_learner(cls, path: str | PathLike[str], solver_options: dict[str, Any]) -> Self:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from .delays import DelaySearch, find_delays
 from .episodes import EpisodeSpread
+from .from_outputs import OutputIdentification, identify_from_outputs
 from .identification import IdentificationConfig
 from .identifying import Identification, identify
+from .observer import KalmanObserver
 from .profiles import with_profiles
 from .residual import Residual, fit_residual, fit_residuals, with_residual
 from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
@@ -16,14 +18,17 @@ __all__ = [
     "EpisodeSpread",
     "Identification",
     "IdentificationConfig",
+    "KalmanObserver",
     "MultiStepCheck",
     "NoiseEstimate",
+    "OutputIdentification",
     "Residual",
     "estimate_noise",
     "find_delays",
     "fit_residual",
     "fit_residuals",
     "identify",
+    "identify_from_outputs",
     "smooth",
     "with_measurement_noise",
     "with_profiles",

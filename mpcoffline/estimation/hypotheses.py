@@ -51,6 +51,7 @@ _MOVING = 0.05  # share of rows
 _LEAST_MOVED = 0.2  # of two readings that explain as much, the one whose parameters stay
 _ALIKE = 0.4  # logarithm that two parameters or more must be off by, for one pace to be the cause
 _BY_CHANCE = 0.1  # that parameters off at random would share a pace
+_PACES = 3  # that are looked at closely
 _MOST_INSTRUCTIONS = 20_000
 
 
@@ -137,7 +138,7 @@ def _paced(mpc: MPC, reading: Reading, plain: Judged) -> Iterator[Finding]:
         return
     size = float(np.sqrt(np.mean(plain.z**2)))
     best, nearest = 1.0, size * _BY_CHANCE ** (1.0 / (len(plain.z) - 1))
-    for factor, other in _other_paces(mpc):
+    for factor, other in _likely_paces(mpc, reading):
         found = _Judge(other, reading).identified(reading)
         left = float(np.sqrt(np.mean(found.z**2)))
         if left < nearest and _no_worse(found, plain):
@@ -325,6 +326,19 @@ def _moves(read: Reading, plain: Reading) -> bool:
         return False
     moving = [(r.reached != r.x).mean(axis=0) > _MOVING for r in (read, plain)]
     return bool((moving[0] | ~moving[1]).all())
+
+
+def _likely_paces(mpc: MPC, reading: Reading) -> list[tuple[float, MPC]]:
+    """Some paces at which the given parameters predict better, the best first: were a pace the cause, its own would."""
+    scale = increments_scale(reading.x, reading.reached)
+
+    def error(other: MPC) -> float:
+        predicted = other.plant_function(reading.x.T, reading.u.T, other.theta).full().T
+        return float(np.nan_to_num(np.abs(predicted - reading.reached) / scale, nan=_FAILED, posinf=_FAILED).mean())
+
+    errors = [(error(other), factor, other) for factor, other in _other_paces(mpc)]
+    better = sorted((each for each in errors if each[0] < error(mpc)), key=lambda each: each[0])
+    return [(factor, other) for _, factor, other in better[:_PACES]]
 
 
 def _other_paces(mpc: MPC) -> Iterator[tuple[float, MPC]]:

@@ -78,8 +78,10 @@ def priced_ends(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> End
     if not ends_matter(table, mpc.discount):
         return None
     last = table.take(np.flatnonzero(np.asarray(table.terminations) > 0.0)).values()
-    scale, offset = (1.0, 0.0) if cost is None else (cost.scale, cost.offset)
-    ours = mpc.stage_function(last.observations.T, last.actions.T, mpc.theta).full().ravel()
-    values = ((last.costs - offset) / scale - ours) / mpc.discount
+    cost = KnownCost() if cost is None else cost
+    ours = cost.stage_costs(mpc, last)
+    values = ((last.costs - cost.offset) / cost.scale - ours) / mpc.discount + cost.of_state(
+        mpc, last.next_observations
+    )
     states, before = (np.asarray(s, dtype=np.float64) for s in (last.next_observations, last.observations))
     return Ends(states, np.asarray(values, dtype=np.float64), before)

@@ -23,7 +23,8 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
 from mpcoffline.mpc.scaling import Scaling
 
-from .stages import Known, KnownCost
+from .normed_cost import normed_cost
+from .stages import ROUNDING, Known, KnownCost
 
 StageCostKind = Literal["fitted", "auto", "given"]
 
@@ -32,7 +33,6 @@ _log = logging.getLogger(__name__)
 #: Rows on which costs are compared.
 COST_ROWS = 20_000
 _CHUNK = 100_000  # rows that are looked at a time
-ROUNDING = 1e-6  # share of the variance that rounding may leave open
 _NOISY = 0.05  # the same where noise in the states may be what is left
 _WHITE = 0.3  # correlation of neighbouring residuals above which these are no noise: wrong costs have .5 to .95
 _EXPLAINED = 0.3  # share of the residual's variance that a quadratic may explain: missing terms are explained whole
@@ -70,7 +70,8 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
             return known
         mpc, found = agreeing
         if mpc is not known.mpc:
-            _log.info("The logged costs are the MPC's stage cost with other parameters, which are taken over")
+            if not found.regressed:
+                _log.info("The logged costs are the MPC's stage cost with other parameters, which are taken over")
             return replace(known, mpc=mpc, cost=found)
     else:
         found = known_cost(known.mpc, rows) or _affine(*_costs(known.mpc, rows)[:2])
@@ -94,7 +95,11 @@ def with_known_cost(known: Known, config: CostConfig) -> Known:
 
 
 def agreeing_cost(mpc: MPC, table: TransitionTable, *, count: int = 4_000) -> tuple[MPC, KnownCost] | None:
-    """The MPC whose stage cost the logged costs are: the given one, or one with other weights; and the relation.
+    """The MPC whose stage cost the logged costs are, and the relation.
+
+    That is the given one, one with other weights, or one with another stage cost
+    (:func:`~mpcoffline.learning.normed_cost.normed_cost`). Costs may be of the state that a step begins with, or of the
+    one that it reaches; of the latter, if all are.
 
     Args:
         mpc: Its stage cost is Lhat.
@@ -104,15 +109,17 @@ def agreeing_cost(mpc: MPC, table: TransitionTable, *, count: int = 4_000) -> tu
     Returns:
         None where no weights make it so.
     """
-    found = known_cost(mpc, table)
-    if found is not None:
-        return mpc, found
-    other = _with_fitted_weights(mpc, table, count)
-    found = None if other is None else known_cost(other, table, noise=False)
-    return None if other is None or found is None else (other, found)
+    for reached in (False, True):
+        found = known_cost(mpc, table, reached=reached)
+        other = mpc if found is not None else _with_fitted_weights(mpc, table, count, reached)
+        if found is None and other is not None:
+            found = known_cost(other, table, noise=False, reached=reached)
+        if other is not None and found is not None:
+            return other, found
+    return normed_cost(mpc, table)
 
 
-def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True) -> KnownCost | None:
+def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True, reached: bool = False) -> KnownCost | None:
     """Whether the logged costs are the MPC's stage cost, ``L = a Lhat(s,a) + b`` with a > 0.
 
     So it is where this explains L to rounding, in all transitions or in a third of them (elsewhere a plant may cut off
@@ -123,30 +130,31 @@ def known_cost(mpc: MPC, table: TransitionTable, *, noise: bool = True) -> Known
         mpc: Its stage cost is Lhat.
         table: Transitions as logged, neighbours in time beside each other.
         noise: Whether noise in the states may explain a residual.
+        reached: Whether ``Lhat(s+,a)`` is asked about; then in all transitions.
 
     Returns:
         The relation; None where there is none.
     """
-    ours, logged, inputs, pairs = _costs(mpc, table)
+    ours, logged, inputs, pairs = _costs(mpc, table, reached)
     if len(logged) and np.ptp(logged) <= 1e-12 * np.abs(logged).max():
         return KnownCost(offset=float(logged.mean()), constant=True)
     if len(logged) < 3 or not np.isfinite(ours).all() or not ours.std() > 0.0:
         return None
-    fit = _affine(ours, logged)
+    fit = replace(_affine(ours, logged), reached=reached)
     if fit.scale > 0.0 and fit.missed <= ROUNDING:
         return _rounded(fit, ours, logged, np.sqrt(ROUNDING))
     if noise and fit.scale > 0.0 and fit.missed <= _NOISY:
         residual = logged - fit.scale * ours - fit.offset
         if _correlation(residual, pairs) <= _WHITE and _explained(inputs, residual) <= _EXPLAINED:
             return _rounded(fit, ours, logged, _AS_WRITTEN)
-    return _partly(ours, logged, inputs)
+    return None if reached else _partly(ours, logged, inputs)
 
 
-def _costs(mpc: MPC, table: TransitionTable) -> tuple[Array, Array, Array, NDArray[np.intp]]:
+def _costs(mpc: MPC, table: TransitionTable, reached: bool = False) -> tuple[Array, Array, Array, NDArray[np.intp]]:
     """Lhat and L ``(n,)``, and (s, a), where no episode ended; and after which of them the episode goes on."""
     columns, episodes = table.values(), np.asarray(table.episode_ids)
     going = np.flatnonzero(columns.terminations == 0.0)
-    s, a = columns.observations[going], columns.actions[going]
+    s, a = (columns.next_observations if reached else columns.observations)[going], columns.actions[going]
     ours = mpc.stage_function(s.T, a.T, mpc.theta).full().ravel()
     pairs = np.flatnonzero((np.diff(going) == 1) & (np.diff(episodes[going]) == 0))
     return ours, np.asarray(columns.costs[going], dtype=np.float64), np.hstack([s, a]), pairs
@@ -281,7 +289,7 @@ def _explained(inputs: Array, residual: Array) -> float:
     return 1.0 - float(np.mean(missed**2)) / variance if variance > 0.0 else 0.0
 
 
-def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int) -> MPC | None:
+def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int, reached: bool) -> MPC | None:
     """The MPC with the cost parameters that are nearest to the logged costs; None where there are none."""
     few = table.sample(count, 0)
     columns, centre = few.values(), table.centring.centre[: table.ny]
@@ -289,7 +297,7 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int) -> MPC | 
     coordinates = Coordinates(mpc, ("cost",), scaling)
     if coordinates.size == 0:
         return None
-    _, logged, inputs, _ = _costs(mpc, few)
+    _, logged, inputs, _ = _costs(mpc, few, reached)
     if not len(logged):  # every row ends an episode
         return None
     s, a, size = inputs[:, : mpc.nx].T, inputs[:, mpc.nx :].T, float(logged.std())

@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation import Identification
 from mpcoffline.mpc import MPC
 
 from .limit_costs import LimitCosts
 from .potential import Potential
 from .value.function import ValueFunction
+
+#: Share of the variance of costs that rounding may leave open.
+ROUNDING = 1e-6
 
 Arrays = dict[str, NDArray[Any]]
 Metrics = dict[str, float]
@@ -77,7 +81,7 @@ class FitResult:
 
 @dataclass(frozen=True)
 class KnownCost:
-    """How the logged costs L follow from the MPC's stage cost: ``L = scale Lhat + offset``.
+    """How the logged costs L follow from the MPC's stage cost: ``L = scale Lhat(s,a) + offset``, or of s+.
 
     Attributes:
         scale: Positive.
@@ -86,6 +90,9 @@ class KnownCost:
         agreeing: Share of the transitions that it holds for.
         tolerance: Where that is not all: up to this, in the unit of the logged costs, it holds for one.
         constant: Whether all logged costs are one number, so that they say nothing about Lhat.
+        reached: Whether they are of the state that a step reaches, ``L = scale Lhat(s+,a) + offset``, as most rewards
+            of simulators.
+        regressed: Whether Lhat is not what was given, but a regression of the logged costs, exact to rounding.
     """
 
     scale: float = 1.0
@@ -94,22 +101,44 @@ class KnownCost:
     agreeing: float = 1.0
     tolerance: float = 0.0
     constant: bool = False
+    reached: bool = False
+    regressed: bool = False
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> KnownCost:
         """The inverse of ``dataclasses.asdict``."""
-        names = ("scale", "offset", "missed", "agreeing", "tolerance")
-        scale, offset, missed, agreeing, tolerance = (float(data[name]) for name in names)
-        return cls(scale, offset, missed, agreeing, tolerance, data["constant"] is True)
+        numbers, flags = ("scale", "offset", "missed", "agreeing", "tolerance"), ("constant", "reached", "regressed")
+        own: dict[str, Any] = {name: float(data[name]) for name in numbers}
+        return cls(**own, **{name: data[name] is True for name in flags})
+
+    def stage_costs(self, mpc: MPC, columns: Columns) -> Array:
+        """Lhat of transitions, ``(n,)``: of the states that the logged costs are of."""
+        s = columns.next_observations if self.reached else columns.observations
+        return np.asarray(mpc.stage_function(s.T, columns.actions.T, mpc.theta).full().ravel())
+
+    def of_state(self, mpc: MPC, s: Array) -> Array:
+        """What T has to hold besides V at states ``(n, nx)``, ``(n,)``; zero where costs are of s.
+
+        Costs of s+ are, along a plan, those of s but for the first, which no input changes, and the last, which is
+        missing: ``sum_k Lhat(x_k+1,u_k) = sum_k Lhat(x_k,u_k) + Lx(x_N) - Lx(x_0)`` with Lx the part of Lhat that
+        depends on the state.
+        """
+        if not self.reached:
+            return np.zeros(len(s))
+        u = np.zeros((mpc.nu, len(s)))
+        return np.asarray(mpc.stage_function(s.T, u, mpc.theta).full().ravel())
 
     def __str__(self) -> str:
         """The relation, in words."""
         if self.constant:
             return "L is the same in all transitions that do not end an episode"
         relation = "Lhat" if self.scale == 1.0 else f"{self.scale:.4g} Lhat"
+        if self.regressed:
+            relation = "a quadratic with norms"
+        of = " of the state reached" if self.reached else ""
         offset = f" {self.offset:+.3g}" if self.offset else ""
         where = "" if self.agreeing == 1.0 else f" in {self.agreeing:.0%} of the transitions"
-        return f"L = {relation}{offset}{where}, up to {self.missed:.1g} of Var[L]"
+        return f"L = {relation}{of}{offset}{where}, up to {self.missed:.1g} of Var[L]"
 
 
 @dataclass(frozen=True)

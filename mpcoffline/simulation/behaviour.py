@@ -190,7 +190,7 @@ class Agreement(NamedTuple):
 
 def agreement(
     models: LogModels,
-    cost: Callable[[Array, Array], Array],
+    cost: Callable[[Array, Array, Array], Array],
     table: TransitionTable,
     policy: Any,
     rows: NDArray[np.intp],
@@ -202,7 +202,7 @@ def agreement(
 
     Args:
         models: The models.
-        cost: The stage cost of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``.
+        cost: The stage cost of states ``(B, nx)``, inputs ``(B, nu)`` and states reached ``(B, nx)``, ``(B,)``.
         table: The transitions of the MPC's states.
         policy: What acts, :meth:`Behaviour.replaying` of these rows and steps.
         rows: Starts, ``(s,)``.
@@ -216,11 +216,12 @@ def agreement(
     dearest = float(columns.costs.max())
     for k in range(n_steps):
         u, state = policy.predict(x[:, :, : layout.ny].reshape(-1, layout.ny), state)
-        stage = cost(x.reshape(-1, table.ny), u).reshape(simulated.shape)
-        simulated += np.where(goes_on[:, k], np.nan_to_num(stage, nan=dearest, posinf=dearest), 0.0)
         reached = models.step(x, u.reshape(*simulated.shape, -1))
-        x = np.where(np.isfinite(reached), reached, x)
-        x[:, :, outside] = signals[:, k]
+        following = np.where(np.isfinite(reached), reached, x)
+        following[:, :, outside] = signals[:, k]
+        stage = cost(x.reshape(-1, table.ny), u, following.reshape(-1, table.ny)).reshape(simulated.shape)
+        simulated += np.where(goes_on[:, k], np.nan_to_num(stage, nan=dearest, posinf=dearest), 0.0)
+        x = following
     logged = np.where(goes_on, columns.costs[steps], 0.0).sum(axis=1)
     return Agreement(simulated, logged, cost_spread(columns.costs) * float(goes_on.sum(axis=1).mean()))
 

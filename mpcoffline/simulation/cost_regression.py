@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
+from mpcoffline.estimation.norms import Norms, fit_norms
 from mpcoffline.estimation.small_network import SmallNetwork, fit_small_network
 from mpcoffline.mpc.scaling import cost_spread
-
-from .norms import Norms, fit_norms
 
 _FOLDS = 5
 _BLOCKS = 4  # of consecutive rows in a fold, where there are hardly any episodes

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.learning.known_cost import COST_ROWS, ROUNDING, agreeing_cost, as_applied
+from mpcoffline.learning.known_cost import COST_ROWS, agreeing_cost, as_applied
 from mpcoffline.learning.known_limits import limit_costs_of
-from mpcoffline.learning.stages import KnownCost
+from mpcoffline.learning.stages import ROUNDING, KnownCost
 from mpcoffline.mpc import MPC
 
 from .cost_ends import learned_ends
-from .cost_regression import cost_regressions, folds_of
+from .cost_regression import CostRegression, cost_regressions, folds_of
 
 _ROWS = 20_000
 _FEW = 1_000  # for other weights, which agree with all rows or are none
@@ -24,13 +24,13 @@ class LoggedCost:
     """L(s, a) as the log has it: the MPC's stage cost where that was logged, else a regression of the logged costs.
 
     The MPC's own expression counts where it agrees with all logged costs, up to scale, offset, other weights, and
-    noise in the states (:func:`~mpcoffline.learning.known_cost.known_cost`). Else it is the better one of a
-    quadratic and a small network (:func:`~mpcoffline.simulation.cost_regression.cost_regressions`), of the
-    rows as they were logged: with smoothed ones a regulated plant's cost looks like that of another plant. Rows that
-    end an episode are no part of it; what an end costs is learned by itself. ``L -> a L + b`` changes all costs
-    likewise and nothing else. Where L depends on s+, this is its mean given (s, a). What the MPC's soft limits cost is
-    added as it is written, whether the logged costs contain it or not
-    (:func:`~mpcoffline.learning.known_limits.limit_costs_of`).
+    noise in the states, also in that of s+ (:func:`~mpcoffline.learning.known_cost.agreeing_cost`). Else it is the
+    better one of a quadratic and a small network
+    (:func:`~mpcoffline.simulation.cost_regression.cost_regressions`), of the rows as they were logged: with smoothed
+    ones a regulated plant's cost looks like that of another plant. Where L depends on s+, such a regression is its mean
+    given (s, a). Rows that end an episode are no part of it; what an end costs is learned by itself. ``L -> a L + b``
+    changes all costs likewise and nothing else. What the MPC's soft limits cost is added as it is written, whether the
+    logged costs contain it or not (:func:`~mpcoffline.learning.known_limits.limit_costs_of`).
 
     Args:
         table: The transitions.
@@ -71,38 +71,45 @@ class LoggedCost:
         over = np.asarray(table.terminations) > 0.0
         going = table.take(np.flatnonzero(~over)) if over.any() and not over.all() else table
         rows = going.take(_some(len(going), seed))
-        x, cost = self._columns(rows)
+        cost = rows.values().costs
         self._dearest, self.low = float(cost.max()), float(cost.min())
-        self._regressions = cost_regressions(x, cost, folds_of(rows, seed), seed)
-        others = self._regressions[0 if self.known is not None else 1 :] or self._regressions
-        self._other = others[0]
+        self._reached = self.known is not None and self.known.reached
+        self._regressions: tuple[CostRegression, ...] = ()
+        if self.known is None or self.known.missed > ROUNDING:
+            self._regressions = self._regressed(rows, self._reached, seed)
+        self._others = self._regressions[0 if self.known is not None else 1 :] or self._regressions
         self.r2 = 1.0 - (self._regressions[0].error if self.known is None else self.known.missed)
-        self.r2_second = 1.0 - self._other.error
+        self.r2_second = 1.0 - self._others[0].error if self._others else self.r2
         self.exact = self.known is not None or self._regressions[0].exact
         last = table.take(np.flatnonzero(over)).values()
-        prices = last.costs - self._stage(last.observations, last.actions)
+        prices = last.costs - self._stage(last.observations, last.actions, last.next_observations)
         self.ends = learned_ends(table, prices, seed, self._seen)
 
-    def __call__(self, s: Array, a: Array) -> Array:
-        """L of states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``; the dearest logged cost where it is no number."""
-        return self._with_limits(self._stage(s, a), s, a)
+    def __call__(self, s: Array, a: Array, reached: Array) -> Array:
+        """L of states ``(B, nx)``, inputs ``(B, nu)`` and states reached ``(B, nx)``, ``(B,)``.
 
-    def _stage(self, s: Array, a: Array) -> Array:
+        It is the dearest logged cost where it is no number.
+        """
+        return self._with_limits(self._stage(s, a, reached), s, a)
+
+    def _stage(self, s: Array, a: Array, reached: Array) -> Array:
         """The same without the prices of soft limits."""
+        s = reached if self._reached else s
         if self._mpc is None or self.known is None:
             return self._regressions[0](np.hstack([s[:, : self._seen], a]))
         ours = self._mpc.stage_function(s.T, a.T, self._mpc.theta).full().ravel()
         cost = self.known.scale * ours + self.known.offset
         return np.asarray(np.where(np.isfinite(cost), cost, self._dearest))
 
-    def second(self, s: Array, a: Array) -> Array:
+    def second(self, s: Array, a: Array, reached: Array) -> Array:
         """L by another regression: what both agree on hardly hangs on how L was learned.
 
         It is the same function where that is exact.
         """
-        if self.exact and (self.known is None or self.known.missed <= ROUNDING):
-            return self(s, a)
-        return self._with_limits(self._other(np.hstack([s[:, : self._seen], a])), s, a)
+        if self.exact and (self.known is None or not self._others):
+            return self(s, a, reached)
+        of = reached if self._reached else s
+        return self._with_limits(self._others[0](np.hstack([of[:, : self._seen], a])), s, a)
 
     def _with_limits(self, cost: Array, s: Array, a: Array) -> Array:
         return cost if self.limits is None else cost + self.limits(s, a)
@@ -133,22 +140,26 @@ class LoggedCost:
     def __str__(self) -> str:
         """What the cost is, and how well it agrees with the log, in a sentence."""
         if self.known is not None:
-            said = f"the MPC's own stage cost, {self.known}"
+            own = "a regression of the logged costs" if self.known.regressed else "the MPC's own stage cost"
+            said = f"{own}, {self.known}"
         elif self.exact:
             said = f"{self._regressions[0].name} of states and inputs, exact to rounding"
         else:
             said = (
                 f"{self._regressions[0].name} of states and inputs, learned from the logged costs, of whose variance it"
-                f" explains {_share(self.r2)} on held-out episodes ({self._other.name} beside it, as a check,"
+                f" explains {_share(self.r2)} on held-out episodes ({self._others[0].name} beside it, as a check,"
                 f" {_share(self.r2_second)})"
             )
         if self.limits is not None:
             said += f", and {self.limits.scale:.3g} times the prices of soft limits"
         return f"Costs in simulations: {said}; {self.ends}." if self.ends.count else f"Costs in simulations: {said}."
 
-    def _columns(self, table: TransitionTable) -> tuple[Array, Array]:
-        columns = table.values()
-        return np.hstack([columns.observations[:, : self._seen], columns.actions]), columns.costs
+    def _regressed(self, rows: TransitionTable, reached: bool, seed: int) -> tuple[CostRegression, ...]:
+        """Regressions of the costs of transitions on (s, a), or on (s+, a)."""
+        columns = rows.values()
+        s = columns.next_observations if reached else columns.observations
+        x = np.hstack([s[:, : self._seen], columns.actions])
+        return cost_regressions(x, columns.costs, folds_of(rows, seed), seed)
 
 
 def _agreeing(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | None:

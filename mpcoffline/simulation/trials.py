@@ -292,12 +292,13 @@ class Surroundings:
                 found, courses[i] = controller.predict(seen[:, i].reshape(-1, ny), state=courses[i])
                 u[:, i] = np.asarray(found, dtype=np.float64).reshape(m, len(begun), -1)
             flat = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
-            for costs, function in ((total, self.cost), (second, self.cost.second)):
-                stage = function(*flat).reshape(shape)
-                costs += np.where(over, 0.0, np.where(lost, self._dearest, stage))
             reached = self.models.step(*(each.reshape(m, -1, each.shape[-1]) for each in (x, u))).reshape(x.shape)
             reached[..., :n] += disturbances[:, None, :, k]
-            ended = self.cost.ended(*flat, reached.reshape(flat[0].shape)).reshape(shape) & ~lost & ~over
+            reached[..., n:ny] = signals[:, k]
+            steps = *flat, reached.reshape(flat[0].shape)
+            for costs, function in ((total, self.cost), (second, self.cost.second)):
+                costs += np.where(over, 0.0, np.where(lost, self._dearest, function(*steps).reshape(shape)))
+            ended = self.cost.ended(*steps).reshape(shape) & ~lost & ~over
             total += np.where(ended, self.cost.end_price, 0.0)
             second += np.where(ended, self.cost.end_price, 0.0)
             over |= ended

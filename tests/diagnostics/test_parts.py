@@ -52,8 +52,10 @@ def test_a_quadratic_cost_is_found_exactly() -> None:
     assert cost.r2 > 1.0 - 1e-6
     x, u = np.array([[3.0, -2.0]]), np.array([[1.5]])  # far outside the data
     expected = lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)
-    np.testing.assert_allclose(cost(x, u), expected, rtol=1e-3)
-    assert cost(np.zeros((1, 2)), np.zeros((1, 1))) == pytest.approx(0.0, abs=1e-4)  # cheaper than anything logged
+    np.testing.assert_allclose(cost(x, u, x), expected, rtol=1e-3)
+    assert cost(np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2))) == pytest.approx(
+        0.0, abs=1e-4
+    )  # cheaper than anything logged
     assert cost.low == LOG.costs.min() > 0.0
 
 
@@ -67,7 +69,7 @@ def test_the_cost_of_the_mpc_is_used_where_it_is_the_logged_one() -> None:
     assert cost.exact
     x, u = np.array([[3.0, -2.0], [0.0, 0.0]]), np.array([[1.5], [0.0]])
     expected = 2.0 * (lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)) - 5e3
-    np.testing.assert_allclose(cost(x, u), expected, atol=0.1)
+    np.testing.assert_allclose(cost(x, u, x), expected, atol=0.1)
 
 
 def test_another_cost_is_learned_with_random_features() -> None:
@@ -85,7 +87,7 @@ def test_another_cost_is_learned_with_random_features() -> None:
 def test_a_constant_cost_is_learned() -> None:
     s = np.random.default_rng(0).normal(size=(100, 2))
     cost = LoggedCost(TransitionTable.from_arrays(s, s[:, :1], np.full(100, 3.0), s, np.zeros(100)))
-    np.testing.assert_allclose(cost(s, s[:, :1]), 3.0, rtol=1e-5)
+    np.testing.assert_allclose(cost(s, s[:, :1], s), 3.0, rtol=1e-5)
 
 
 # ---------------------------------------------------------------- ensemble and simulation

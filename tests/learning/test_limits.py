@@ -151,7 +151,7 @@ def test_simulations_pay_for_them() -> None:
         cost = LoggedCost(paid(2.0, limits=price(STATES) if contained else 0.0), mpc=limited())
         s, a = np.array([[0.9, -0.9], [0.1, 0.1]]), np.array([[0.5], [0.5]])
         plain = lq_plant.quadratic(lq_plant.W, s) + lq_plant.quadratic(lq_plant.R, a)
-        np.testing.assert_allclose(cost(s, a), 2.0 * (plain + price(s)), rtol=1e-4)
+        np.testing.assert_allclose(cost(s, a, s), 2.0 * (plain + price(s)), rtol=1e-4)
         assert "2 times the prices of soft limits" in str(cost)
 
 

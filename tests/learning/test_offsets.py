@@ -134,7 +134,7 @@ def test_what_is_said_of_the_data_does_not_depend_on_the_offset() -> None:
     cost = LoggedCost(log(FAR, cost_offset=1e6))
     assert cost.exact
     s = np.array([[FAR + 0.5, 0.2]])
-    assert cost(s, np.array([[0.3]]))[0] - 1e6 == pytest.approx(0.25 + 0.1 * 0.04 + 0.01 * 0.09, abs=1e-3)
+    assert cost(s, np.array([[0.3]]), s)[0] - 1e6 == pytest.approx(0.25 + 0.1 * 0.04 + 0.01 * 0.09, abs=1e-3)
     assert outside_support(FAR_LOG, FAR_LOG.observations[:50] + np.array([0.0, 9.0])) == 1.0
 
 

@@ -43,7 +43,9 @@ def test_limits_of_one_coordinate_and_the_price_beyond_them(price: float) -> Non
     clear = np.minimum(np.abs(s[:, 0] + 0.8), np.abs(s[:, 0] - 1.0)) > 0.05
     np.testing.assert_array_equal(cost.ended(s, s[:, :1], s)[clear], ((s[:, 0] < -0.8) | (s[:, 0] > 1.0))[clear])
     assert cost.end_price == pytest.approx(price, abs=0.1)
-    np.testing.assert_allclose(cost(0.5 * s, s[:, :1]), np.sum((0.5 * s) ** 2, axis=1), atol=0.05)  # without the price
+    np.testing.assert_allclose(
+        cost(0.5 * s, s[:, :1], 0.5 * s), np.sum((0.5 * s) ** 2, axis=1), atol=0.05
+    )  # without the price
     assert "s0 >" in str(cost)
     assert "s0 <" in str(cost)
 

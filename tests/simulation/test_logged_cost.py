@@ -39,11 +39,12 @@ def kinked(s: Array, a: Array) -> Array:
     return np.abs(s[:, 0]) + np.sin(3.0 * s[:, 1]) + a[:, 0] ** 2
 
 
-def at(x: list[float]) -> tuple[Array, Array]:
-    return np.array([x[:2]]), np.array([x[2:]])
+def at(x: list[float]) -> tuple[Array, Array, Array]:
+    return np.array([x[:2]]), np.array([x[2:]]), np.array([x[:2]])
 
 
 POINTS = (np.random.default_rng(5).uniform(-1, 1, (300, 2)), np.random.default_rng(6).uniform(-1, 1, (300, 1)))
+STEPS_OF = (*POINTS, POINTS[0])  # as arguments of costs
 
 
 @pytest.fixture(scope="module")
@@ -70,18 +71,18 @@ def test_a_quadratic_under_noise_stays_one(of_quadratic: LoggedCost) -> None:
     cost = of_quadratic
     assert not cost.exact
     assert "a quadratic of states and inputs" in str(cost)
-    for predicted in (cost(*POINTS), cost.second(*POINTS)):
+    for predicted in (cost(*STEPS_OF), cost.second(*STEPS_OF)):
         np.testing.assert_allclose(predicted, quadratic(*POINTS), atol=0.08)
-    assert not np.array_equal(cost(*POINTS), cost.second(*POINTS))
+    assert not np.array_equal(cost(*STEPS_OF), cost.second(*STEPS_OF))
 
 
 def test_a_cost_with_kinks_has_norms_and_so_has_the_check(of_kinked: LoggedCost) -> None:
     assert "a quadratic with norms" in str(of_kinked)
     spread = float(np.std(kinked(*POINTS)))
-    errors = [(f(*POINTS) - kinked(*POINTS)).std() / spread for f in (of_kinked, of_kinked.second)]
+    errors = [(f(*STEPS_OF) - kinked(*POINTS)).std() / spread for f in (of_kinked, of_kinked.second)]
     assert max(errors) < 0.1
     assert 1.0 - of_kinked.r2 == pytest.approx(max(errors) ** 2, abs=0.01)
-    assert not np.array_equal(of_kinked(*POINTS), of_kinked.second(*POINTS))
+    assert not np.array_equal(of_kinked(*STEPS_OF), of_kinked.second(*STEPS_OF))
 
 
 def test_what_the_successor_decides_is_its_mean() -> None:
@@ -89,28 +90,28 @@ def test_what_the_successor_decides_is_its_mean() -> None:
     w = 0.1 * np.random.default_rng(3).normal(size=N)
     cost = LoggedCost(log(lambda s, a: (0.9 * s[:, 0] + a[:, 0] + w) ** 2))
     s, a = POINTS
-    np.testing.assert_allclose(cost(s, a), (0.9 * s[:, 0] + a[:, 0]) ** 2 + 0.01, atol=0.15)
+    np.testing.assert_allclose(cost(s, a, s), (0.9 * s[:, 0] + a[:, 0]) ** 2 + 0.01, atol=0.15)
 
 
 def test_logged_rows_count_not_smoothed_ones() -> None:
     """Smoothing moved the states to a half: the cost of the logged ones is the one."""
     raw = log(quadratic)
     smooth = raw.with_states(0.5 * raw.observations, 0.5 * raw.next_observations)
-    np.testing.assert_allclose(LoggedCost(smooth, logged=raw)(*POINTS), quadratic(*POINTS), atol=1e-4)
+    np.testing.assert_allclose(LoggedCost(smooth, logged=raw)(*STEPS_OF), quadratic(*POINTS), atol=1e-4)
 
 
 def test_coordinates_that_a_cost_does_not_see() -> None:
     cost = LoggedCost(log(lambda s, a: s[:, 0] ** 2 + a[:, 0] ** 2), seen=1)
     s, a = POINTS
-    np.testing.assert_allclose(cost(s + np.array([0.0, 1e6]), a), s[:, 0] ** 2 + a[:, 0] ** 2, atol=1e-4)
+    np.testing.assert_allclose(cost(s + np.array([0.0, 1e6]), a, s), s[:, 0] ** 2 + a[:, 0] ** 2, atol=1e-4)
 
 
 def test_a_log_that_is_too_short_for_anything() -> None:
     for n in (1, 3):
         s = np.linspace(0.0, 1.0, n)[:, None]
         cost = LoggedCost(TransitionTable.from_arrays(s, s, s[:, 0], s, np.zeros(n), np.zeros(n, int)))
-        assert np.isfinite(cost(s, s)).all()
-        assert np.isfinite(cost.second(s, s)).all()
+        assert np.isfinite(cost(s, s, s)).all()
+        assert np.isfinite(cost.second(s, s, s)).all()
 
 
 # ---------------------------------------------------------------- beyond the data
@@ -144,14 +145,14 @@ def test_an_affine_change_of_the_cost_changes_nothing_else(
 ) -> None:
     """L -> a (L + b), up to the rounding of the table to float32."""
     changed = LoggedCost(log(lambda s, a: scale * (quadratic(s, a) + offset), noise=0.03))
-    np.testing.assert_allclose(changed(*POINTS) / scale - offset, of_quadratic(*POINTS), atol=1e-4)
+    np.testing.assert_allclose(changed(*STEPS_OF) / scale - offset, of_quadratic(*STEPS_OF), atol=1e-4)
     assert changed.r2 == pytest.approx(of_quadratic.r2, abs=1e-5)
 
 
 def test_another_unit_of_the_cost_changes_no_network(of_kinked: LoggedCost) -> None:
     changed = LoggedCost(log(lambda s, a: 1024.0 * kinked(s, a)))
     for f, g in ((of_kinked, changed), (of_kinked.second, changed.second)):
-        np.testing.assert_allclose(g(*POINTS), 1024.0 * f(*POINTS), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(g(*STEPS_OF), 1024.0 * f(*STEPS_OF), rtol=1e-6, atol=1e-6)
 
 
 # ---------------------------------------------------------------- the user's own
@@ -166,8 +167,8 @@ def test_weights_of_the_mpc_that_are_not_those_of_the_log() -> None:
     for mpc in (own, other):
         cost = LoggedCost(table, mpc=mpc)
         assert cost.exact
-        np.testing.assert_allclose(cost(x, u), expected, rtol=1e-3)
-        np.testing.assert_array_equal(cost.second(x, u), cost(x, u))
+        np.testing.assert_allclose(cost(x, u, x), expected, rtol=1e-3)
+        np.testing.assert_array_equal(cost.second(x, u, x), cost(x, u, x))
         assert "the MPC's own stage cost" in str(cost)
 
 

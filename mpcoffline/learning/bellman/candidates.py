@@ -26,7 +26,8 @@ def candidates(
     * ``"identified"``: the identified model, all else as given;
     * ``"identified, farther"``: the same with horizon and discount of the whole fit;
     * ``"identified, V"``: the identified model, the given stage cost, and V as the terminal cost;
-    * ``"fitted cost"``: model and stage cost of the whole fit, all else as given.
+    * ``"fitted cost"``: model and stage cost of the whole fit, all else as given;
+    * ``"logged cost"``: the same, where the log's costs are a regression exactly, with the terminal cost in their unit.
 
     What is the same as another is left out; so is V as terminal cost where V says nothing.
 
@@ -43,12 +44,14 @@ def candidates(
         given = given.replace(horizon=full.horizon, discount=full.discount)
     model = known.found.model if "model" in known.groups else full.model
     own = given.replace(model=given.model.with_delay(full.model.delay), applied_before=full.applied_before)
-    if known.cost is not None:
+    if known.cost is not None and not known.cost.regressed:
         own = own.replace(stage_cost=full.stage_cost)  # with the logged weights, where these were taken over
     plain = own.replace(model=model)
     farther = plain.replace(horizon=full.horizon, discount=full.discount)
     found = {"identified": plain, "identified, farther": farther}  # which may be the same
     if known.cost is not None:
+        if known.cost.regressed:
+            found["logged cost"] = in_units_of(plain, known.table).replace(stage_cost=full.stage_cost)
         return found
     alike = repriced_as_logged(in_units_of(plain, known.table), known)
     fitted = {"fitted cost": alike.replace(model=full.model, stage_cost=full.stage_cost)}

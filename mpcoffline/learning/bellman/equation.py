@@ -37,7 +37,7 @@ class BellmanProblem:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
         self.n_states, self._ny = mpc.layout.n_states, mpc.ny
         self._value, self._discount, self.unit = value, mpc.discount, unit
-        self._scale = 1.0 if cost is None else cost.scale
+        self._scale, self._of_reached = (1.0, False) if cost is None else (cost.scale, cost.reached)
         self._last: tuple[Columns, Tensor, Tensor] | None = None
 
     def discounted(self, batch: Columns) -> Tensor:
@@ -73,8 +73,9 @@ class BellmanProblem:
         return value
 
     def stage_cost(self, batch: Columns, theta: Tensor) -> Tensor:
-        """Lhat_th(s,a), ``(B,)``."""
-        cost: Tensor = self._stage(batch.observations.double(), batch.actions.double(), theta)
+        """Lhat_th(s,a), ``(B,)``; of s+ where the logged costs are of that."""
+        s = batch.next_observations if self._of_reached else batch.observations
+        cost: Tensor = self._stage(s.double(), batch.actions.double(), theta)
         return self._scale * cost.squeeze(-1)
 
     def error(self, batch: Columns, theta: Tensor) -> Tensor:

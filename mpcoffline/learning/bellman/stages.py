@@ -24,6 +24,7 @@ from mpcoffline.learning.potential import Potential
 from mpcoffline.learning.stages import Known, KnownCost, Stage, Training
 from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
+from mpcoffline.learning.value.function import ValueFunction
 from mpcoffline.learning.value.training import ValueTraining
 from mpcoffline.mpc import MPC, Model, NormCost, TerminalCost
 from mpcoffline.mpc.penalties import paid_in_value, repriced
@@ -100,7 +101,7 @@ def _begun_as_logged(known: Known, model: Model) -> MPC:
     if known.begun is None or known.mpc.applied_before is not None:
         return known.mpc
     cost, costs = known.cost, None
-    if cost is not None and not cost.constant:
+    if cost is not None and not (cost.constant or cost.reached):
         costs = partial(_unscaled, cost)
     applied = applied_before(known.mpc.replace(model=model), known.begun, costs)
     if applied is None:
@@ -236,10 +237,9 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
         _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")
     elif config.method != "norm":
         value, potential = known.constant_value, None if known.result is None else known.result.potential
-        scale = 1.0 if known.cost is None else known.cost.scale
         cost = fit_terminal(
             "quadratic" if config.method == "quadratic" else "network",
-            lambda s: (value(s) if potential is None else value(s) - potential(s)) / scale,
+            partial(_terminal, known, value, potential),
             known.table.sample(_TERMINAL_ROWS, 0).observations,
             x_ref=goal,
             blend=config.blend,
@@ -250,6 +250,16 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
     if exact is None and config.method != "norm" and known.limits is not None:
         mpc = paid_in_value(mpc)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
+
+
+def _terminal(known: Known, value: ValueFunction, potential: Potential | None, s: torch.Tensor) -> torch.Tensor:
+    """V - Phi in the unit of the stage cost, and what this lacks at x_N where it is of the state reached."""
+    wanted: torch.Tensor = value(s) if potential is None else value(s) - potential(s)
+    if known.cost is not None:
+        wanted = wanted / known.cost.scale
+    if known.cost is not None and known.cost.reached:
+        wanted = wanted + torch.from_numpy(known.cost.of_state(known.mpc, s.double().numpy())).to(wanted)
+    return wanted
 
 
 def _norm_rounding(table: TransitionTable) -> float:

@@ -47,6 +47,7 @@ _FORMATS = {
 # GCC's effort grows with the square of a function's length. Only functions of costs that are networks are so long.
 _LONGEST = 2500
 _PIECE = 500
+_LARGEST_POWER = 4 * 6  # in quarters
 
 
 def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> str:
@@ -85,7 +86,8 @@ def _function(name: str, arguments: str, statements: list[str], unused: list[str
 def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
     """One C statement an instruction; values that a later piece reads go through the array ``w`` of all pieces.
 
-    Divisions multiply by reciprocals, as a model's derivatives divide by the same few numbers again and again.
+    Divisions multiply by reciprocals, as a model's derivatives divide by the same few numbers again and again. Powers
+    of quarters are products of the base and its roots: lanes share an instruction for these, none for ``pow``.
     """
     value_in: dict[int, int] = {}  # by place in the work vector: the instruction whose value is there
     read: list[dict[int, int]] = []  # of each instruction: the places that it reads, and whose values they are
@@ -97,6 +99,7 @@ def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
             value_in[targets[0]] = k
     statements = []
     reciprocals: set[tuple[int, int]] = set()  # those that are known: piece, number of the divisor
+    roots: set[tuple[int, str, int]] = set()  # likewise: piece, half or quarter power, number of the base
     for k, (op, sources, targets, constant) in enumerate(program):
         start = k - k % piece
         first = ""
@@ -118,6 +121,13 @@ def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
                 reciprocals.add((start, divisor))
                 first = f"const vd r{divisor} = 1.0 / {names[-1]}; "
             result = " * ".join([*names[:-1], f"r{divisor}"])
+        elif op in (ca.OP_POW, ca.OP_CONSTPOW) and (power := _rooted(program[read[k][sources[1]]])) is not None:
+            base = read[k][sources[0]]
+            for root, of in (("h", names[0]), ("q", f"h{base}"))[: _roots_of(power)]:
+                if (start, root, base) not in roots:
+                    roots.add((start, root, base))
+                    first += f"const vd {root}{base} = vd_sqrt({of}); "
+            result = _product(power, names[0], base)
         elif op in _FORMATS:
             result = _FORMATS[op].format(*names)
         else:
@@ -125,6 +135,26 @@ def _statements(name: str, program: list[Instruction], piece: int) -> list[str]:
         kept = f" w[{targets[0]}] = v{k};" if last_read.get(k, k) >= start + piece else ""
         statements.append(f"{first}const vd v{k} = {result};{kept}")
     return statements
+
+
+def _rooted(exponent: Instruction) -> int | None:
+    """How many quarters an exponent is; None where it is no number, of no quarters, or a large one."""
+    op, _, _, constant = exponent
+    quarters = 4.0 * constant if op == ca.OP_CONST else np.nan
+    return int(quarters) if 0.0 < abs(quarters) <= _LARGEST_POWER and quarters == round(quarters) else None
+
+
+def _roots_of(quarters: int) -> int:
+    """How many roots in a row a power needs: of none, of the base, of that root, too."""
+    return 2 if quarters % 2 else quarters % 4 // 2
+
+
+def _product(quarters: int, base: str, number: int) -> str:
+    """The power as a product of the base and its roots."""
+    whole, rest = divmod(abs(quarters), 4)
+    factors = [base] * whole + [f"h{number}"] * (rest >= 2) + [f"q{number}"] * (rest % 2)
+    product = " * ".join(factors)
+    return product if quarters > 0 else f"1.0 / ({product})"
 
 
 def literal(value: float) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 import scipy.optimize
 
+from mpcoffline.estimation.norms import _Projected, fit_norms
 from mpcoffline.simulation.cost_regression import cost_regressions
-from mpcoffline.simulation.norms import _Projected, fit_norms
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(-1.0, 1.0, (2_000, 5))
@@ -43,7 +44,7 @@ def test_noise_on_a_quadratic_is_no_norm() -> None:
 
 def test_the_error_has_the_gradient_it_says() -> None:
     problem = _Projected(np.hstack([np.ones((60, 1)), X[:60]]), X[:60], distance(X[:60]))
-    problem.solved(2, 3, np.random.default_rng(1))
+    problem.solved(np.random.default_rng(1).normal(size=(2, 3, 5)), np.random.default_rng(1))
     p = np.random.default_rng(2).normal(size=2 * 3 * 5 + 2 * 3 + 2)
     assert scipy.optimize.check_grad(lambda q: problem._error(q)[0], lambda q: problem._error(q)[1], p) < 1e-6
 
@@ -52,3 +53,23 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
     data = X[:500], distance(X[:500])
     first, again = (fit_norms(data, data, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(first(X), again(X))
+
+
+def test_absolute_errors_of_each_coordinate_are_found() -> None:
+    """More of them than norms are looked for at random."""
+    weights = np.array([1.0, 3.0, 0.5, 2.0, 0.1])
+    y = np.abs(X) @ weights
+    y = (y - y.mean()) / y.std()
+    norms = fit_norms((X[:1_000], y[:1_000]), (X[1_000:1_500], y[1_000:1_500]), np.random.default_rng(0))
+    assert np.mean((norms(X[1_500:]) - y[1_500:]) ** 2) < 1e-7
+
+
+def test_the_expression_is_the_function() -> None:
+    y = np.hypot(X[:, 0], X[:, 1]) - 0.1 * X[:, 4] ** 2
+    y = (y - y.mean()) / y.std()
+    norms = fit_norms((X[:1_000], y[:1_000]), (X[1_000:], y[1_000:]), np.random.default_rng(0))
+    x = ca.SX.sym("x", 5)
+    same = ca.Function("L", [x], [norms.expression(x, 0.0 * norms.sizes(X))])
+    np.testing.assert_allclose(same(X.T).full().ravel(), norms(X), atol=1e-9)
+    blunt = ca.Function("L", [x], [norms.expression(x, 0.1 * norms.sizes(X))])(X.T).full().ravel()
+    assert 1e-3 < np.abs(blunt - norms(X)).max() < 0.3  # at the kink alone

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 import scipy.optimize
+from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
 from mpcoffline.estimation.features import RandomFeatures
 from mpcoffline.mpc.scaling import spread_of
 
 _SHAPES = ((1, 3), (2, 3), (3, 1))  # norms, and how many directions each is of: a distance, two, absolute errors
+_EXACT = 1e-8  # of the variance of unit costs: no need to look further
 _STARTS = 4  # of each
 _OPTIONS: Any = {"maxiter": 300, "maxcor": 30, "ftol": 1e-9, "gtol": 1e-8}
+_REFINING: Any = {"maxiter": 500, "maxfun": 2_000, "maxcor": 50, "ftol": 1e-12, "gtol": 1e-12}
+_NEARLY = 1e-4  # of the variance of unit costs, missed: may be exact
+_LIGHTER = 1e-5  # the penalty on weights then
 _ROWS = 2_000
 _RIDGE = 1e-9  # of the mean square of the features
 _WIDTH = 0.4  # of a kink, in spreads, to begin with
@@ -50,6 +57,29 @@ class Norms(NamedTuple):
         norms = _norms((x - self.mean) / self.spread, self.directions, self.offsets, self.widths)[1]
         return np.asarray(np.hstack([self.features(x), norms]) @ self.weights)
 
+    def expression(self, x: ca.SX, least: Array) -> ca.SX:
+        """The same as a CasADi scalar in x ``(d, 1)``.
+
+        Args:
+            x: The symbols.
+            least: What the widths are at least, ``(j,)``: a method that follows slopes creeps at sharp kinks.
+        """
+        z = (x - self.mean) / self.spread
+        quadratic = [ca.SX(1), *ca.vertsplit(z), *(z[int(i)] * z[int(j)] for i, j in zip(*self._pairs, strict=True))]
+        widths = np.maximum(np.exp(self.widths), least)
+        each = zip(self.directions, self.offsets, widths, strict=True)
+        norms = [ca.sqrt(ca.sumsqr(ca.DM(C) @ z + ca.DM(d)) + e**2) for C, d, e in each]
+        return ca.dot(ca.DM(self.weights), ca.vertcat(*quadratic, *norms))
+
+    def sizes(self, x: Array) -> Array:
+        """How large the norms are at x ``(n, d)``: the roots of their mean squares, ``(j,)``."""
+        norms = _norms((x - self.mean) / self.spread, self.directions, self.offsets, self.widths)[1]
+        return np.asarray(np.sqrt(np.mean(norms**2, axis=0)))
+
+    @property
+    def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        return np.triu_indices(len(self.mean))
+
 
 def fit_norms(data: tuple[Array, Array], ends: tuple[Array, Array], rng: np.random.Generator) -> Norms:
     """Learns one by least squares from several starts: of some shapes, the one that is best on other rows.
@@ -69,12 +99,22 @@ def fit_norms(data: tuple[Array, Array], ends: tuple[Array, Array], rng: np.rand
     features, mean, spread = RandomFeatures(x, 0, rng), x.mean(axis=0), spread_of(x)
     projected = _Projected(features(x), (x - mean) / spread, y)
     found: list[tuple[float, Norms]] = []
+    for directions in _starts(x.shape[1], rng):
+        norms = Norms(features, mean, spread, *projected.solved(directions, rng))
+        found.append((float(np.mean((norms(ends[0]) - ends[1]) ** 2)), norms))
+        if found[-1][0] <= _EXACT:
+            break
+    missed, best = min(found, key=lambda each: each[0])
+    return best if missed > _NEARLY else Norms(features, mean, spread, *projected.refined(best))
+
+
+def _starts(d: int, rng: np.random.Generator) -> Iterator[Array]:
+    """Directions ``(j, r, d)`` to begin with: at random of each shape; along all axes, for absolute errors."""
     for count, size in _SHAPES:
         for _ in range(_STARTS):
-            parts = projected.solved(count, min(size, x.shape[1]), rng)
-            norms = Norms(features, mean, spread, *parts)
-            found.append((float(np.mean((norms(ends[0]) - ends[1]) ** 2)), norms))
-    return min(found, key=lambda each: each[0])[1]
+            yield rng.standard_normal((count, min(size, d), d)) / np.sqrt(d)
+    if d > 1:
+        yield np.eye(d)[:, None, :]
 
 
 class _Projected:
@@ -85,20 +125,50 @@ class _Projected:
         self._gram, self._slope = q.T @ q / len(q), q.T @ y / len(q)
         self._ridge = _RIDGE * float(np.trace(self._gram)) / len(self._gram)
 
-    def solved(self, count: int, size: int, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
-        """Directions, offsets, logarithms of widths and weights of a number of norms of some directions each."""
-        d = self._z.shape[1]
-        self._shapes = (count, size, d), (count, size), (count,)
+    def solved(self, directions: Array, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+        """Directions, offsets, logarithms of widths and weights of norms, begun at directions ``(j, r, d)``."""
+        count, size, d = directions.shape
+        self._shapes: tuple[tuple[int, ...], ...] = (count, size, d), (count, size), (count,)
         start = [
-            rng.standard_normal(self._shapes[0]).ravel() / np.sqrt(d),
+            directions.ravel(),
             0.3 * rng.standard_normal(count * size),
             np.full(count, np.log(_WIDTH)),
         ]
-        bounds = [(None, None)] * (count * size * (d + 1)) + [(np.log(_SHARPEST), np.log(_WIDEST))] * count
         done = scipy.optimize.minimize(
-            self._error, np.concatenate(start), jac=True, method="L-BFGS-B", bounds=bounds, options=_OPTIONS
+            self._error, np.concatenate(start), jac=True, method="L-BFGS-B", bounds=self._bounds(), options=_OPTIONS
         )
-        parts = self._parts(done.x)
+        return self._whole(done.x)
+
+    def refined(self, norms: Norms) -> tuple[Array, Array, Array, Array]:
+        """The same, begun at some that are nearly exact: what is exact becomes so to rounding, nothing else does.
+
+        It is the logarithm of the error that falls, and hardly any weight is too large.
+        """
+        start = norms.directions, norms.offsets, norms.widths
+        self._shapes, self._ridge = tuple(part.shape for part in start), self._ridge * _LIGHTER
+
+        def logarithm(p: Array) -> tuple[float, Array]:
+            error, slope = self._error(p)
+            error = max(error, np.finfo(np.float64).tiny)
+            return float(np.log(error)), slope / error
+
+        done = scipy.optimize.minimize(
+            logarithm,
+            np.concatenate([part.ravel() for part in start]),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=self._bounds(),
+            options=_REFINING,
+        )
+        return self._whole(done.x)
+
+    def _bounds(self) -> list[tuple[float | None, float | None]]:
+        *free, widths = (int(np.prod(shape)) for shape in self._shapes)
+        low, high = float(np.log(_SHARPEST)), float(np.log(_WIDEST))
+        return [*[(None, None)] * sum(free), *[(low, high)] * widths]
+
+    def _whole(self, p: Array) -> tuple[Array, Array, Array, Array]:
+        parts = self._parts(p)
         return (*parts, self._weights(_norms(self._z, *parts)[1]))
 
     def _parts(self, p: Array) -> tuple[Array, Array, Array]:

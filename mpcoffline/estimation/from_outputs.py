@@ -1,0 +1,272 @@
+"""Model and states from logs that hold outputs in place of states."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import torch
+from numpy.typing import ArrayLike
+
+from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.scaling import Scaling
+
+from .observer import KalmanObserver, OutputModel, Outputs
+from .output_episodes import (
+    OutputEpisodes,
+    OutputPoint,
+    filtered_outputs,
+    output_episodes,
+    smoothed_states,
+    with_states,
+)
+
+_log = logging.getLogger(__name__)
+
+_ROWS = 2_000  # that parameters are searched on
+_LONGEST = 100  # steps of a stretch there
+_STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 60
+_AWAY = 0.7  # standard deviation of the starts, in logarithms or scaled coordinates
+_PROCESS = 0.01  # of the spread of starts: what the model is first taken to miss in a step
+_WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of the priors
+_STEP = 1e-4  # of differences
+_UNKNOWN = 0.5  # of the prior's standard deviation: what is left so wide was not told by the log
+_SEEN = 0.5  # share of a state's variance that outputs have to remove
+
+
+@dataclass(frozen=True)
+class OutputIdentification:
+    """What outputs say of plant, noise and states.
+
+    Attributes:
+        mpc: The MPC with the identified model.
+        outputs: h, as it was given.
+        noise: Standard deviation of the error of each output, ``(n_outputs,)``.
+        process: Standard deviation of what the model misses of each state in a step, ``(n_states,)``.
+        start: Mean of the states where episodes begin, ``(n_states,)``.
+        start_spread: As it was given, ``(n_states,)``.
+        names: Names of the parameters that were learned, ``(p,)``.
+        deviations: Their standard deviations, in logarithms for those above zero, ``(p,)``.
+        undetermined: Names of those of which the log hardly says anything: these stay near what was given.
+        seen: Share of each state's first variance that outputs remove along an episode, ``(n_states,)``.
+        table: The log with smoothed states in place of outputs: what a learner takes.
+    """
+
+    mpc: MPC
+    outputs: Outputs
+    noise: Array
+    process: Array
+    start: Array
+    start_spread: Array
+    names: tuple[str, ...]
+    deviations: Array
+    undetermined: tuple[str, ...]
+    seen: Array
+    table: TransitionTable
+
+    def observer(self, mpc: MPC | None = None, *, disturbance: ArrayLike | None = None) -> KalmanObserver:
+        """An observer with what was found, for an MPC that was learned from the table, or for this one.
+
+        Args:
+            mpc: The MPC that acts.
+            disturbance: See :class:`KalmanObserver`.
+        """
+        return KalmanObserver(
+            self.mpc if mpc is None else mpc,
+            self.outputs,
+            self.noise,
+            self.process,
+            start=self.start,
+            start_spread=self.start_spread,
+            disturbance=disturbance,
+        )
+
+    def __str__(self) -> str:
+        """What was found, in sentences."""
+        labels = self.mpc.layout.y_labels
+        hidden = [str(labels[i]) for i in np.flatnonzero(self.seen < _SEEN)]
+        said = [f"From outputs: noise {_listed(self.noise)}, the model misses {_listed(self.process)} a step."]
+        if self.undetermined:
+            said.append(f"The log hardly says anything of {', '.join(self.undetermined)}.")
+        if hidden:
+            said.append(f"Outputs hardly show {', '.join(hidden)}: what is learned of it is the model's word.")
+        return " ".join(said)
+
+
+def identify_from_outputs(
+    mpc: MPC,
+    log: TransitionTable,
+    outputs: Outputs,
+    *,
+    start: ArrayLike | None = None,
+    start_spread: ArrayLike,
+    seed: int = 0,
+) -> OutputIdentification:
+    """Model parameters, noise and states from a log of outputs, by the largest likelihood of its innovations.
+
+    An extended Kalman filter runs over the log; theta, the noise of the outputs, what the model misses, and the mean of
+    the starts are where its innovations e with covariances S are likeliest, with wide priors about what was given::
+
+        sum_k e_k' S_k^-1 e_k + log det S_k   (Ljung, "System Identification", 2nd ed., 1999, section 7.4)
+
+    from several starts, on about 2,000 rows. The states of the table are smoothed with what was found (Rauch, Tung,
+    Striebel), so that :class:`~mpcoffline.OfflineMPCLearner` takes it like any log.
+
+    Example:
+        >>> found = identify_from_outputs(mpc, log, [0], start_spread=[1.0, 0.5])
+        >>> learner.fit(found.table)
+        >>> policy = OutputFeedbackPolicy(learner.policy, found.observer(learner.mpc))
+
+    Args:
+        mpc: Its model is the one to identify.
+        log: Transitions whose observations are the outputs, then the signals, if the plant has some.
+        outputs: Which states are measured, or a function of them.
+        start: Mean of the states where episodes begin, as far as is known, ``(n_states,)``; where an output is a state,
+            the log's own mean goes before it. At rest by default.
+        start_spread: How far they are from that, standard deviation, ``(n_states,)``: the scale of states that nobody
+            has measured.
+        seed: Picks rows and starts.
+
+    Raises:
+        InvalidArgumentError: For outputs of another number than the log's, or what :class:`KalmanObserver` refuses.
+        InvalidDataError: If an output never moves, or episodes are too short to see a state in them.
+    """
+    model = OutputModel(mpc, outputs)
+    given = KalmanObserver(mpc, outputs, 1.0, 0.0, start=start, start_spread=start_spread)
+    data = output_episodes(mpc, log, model.n_outputs)
+    search = _Search(mpc, model, data.some(_ROWS, _LONGEST, seed), _first_start(given, data), given.start_spread, log)
+    v = search.best(seed)
+    found, curvature = search.found(v), search.curvature(v)
+    p = search.coordinates.size
+    wide = np.sqrt(np.diag(np.linalg.pinv(curvature)))[:p]
+    names = tuple(n for n, learned in zip(mpc.space.names, search.coordinates.mask, strict=True) if learned)
+    unknown = tuple(n for n, d in zip(names, wide, strict=True) if d > _UNKNOWN * _WIDTHS["parameters"])
+    identified = mpc.with_theta(canonical(mpc, found.theta))
+    states, seen = smoothed_states(model, data, found, given.start_spread)
+    table = with_states(log, states, data, model.n_outputs)
+    result = OutputIdentification(
+        identified,
+        outputs,
+        found.noise,
+        found.process,
+        found.start,
+        given.start_spread,
+        names,
+        wide * np.where(search.coordinates.logarithmic, 1.0, search.coordinates.scale),
+        unknown,
+        seen,
+        table,
+    )
+    (_log.warning if unknown or (seen < _SEEN).any() else _log.info)("%s", result)
+    return result
+
+
+class _Search:
+    """The likelihood of innovations as a function of scaled coordinates v: parameters, logarithms of noise, starts.
+
+    Args:
+        mpc: The problem.
+        model: What outputs are of it.
+        data: The rows that it is searched on.
+        start: Mean of the states where they begin.
+        spread: Its uncertainty.
+        log: All transitions.
+    """
+
+    def __init__(
+        self, mpc: MPC, model: OutputModel, data: OutputEpisodes, start: Array, spread: Array, log: TransitionTable
+    ) -> None:
+        self._model, self._data, self._spread = model, data, spread
+        noise = _first_noise(data)
+        self._first = OutputPoint(mpc.theta, noise, np.maximum(_PROCESS * spread, np.finfo(np.float64).tiny), start)
+        states, _, _ = filtered_outputs(model, data, self._first, spread)
+        x = np.stack([states[k].x for k in range(len(states))])
+        valid = np.arange(len(data.acting))[:, None] < data.lengths
+        steps = x[:-1][valid], data.acting[valid][:, : mpc.nu], x[1:][valid]
+        scaling = Scaling.of(steps[0], steps[1], log.values().costs, steps[2])
+        self.coordinates = Coordinates(mpc, ("model",), scaling)
+        parts = {"parameters": self.coordinates.size, "noise": len(noise), "process": len(spread), "start": len(spread)}
+        self._widths = np.concatenate([np.full(n, _WIDTHS[name]) for name, n in parts.items()])
+        self._ends = np.cumsum(list(parts.values()))[:-1]
+        free = np.full(sum(list(parts.values())[1:]), np.inf)
+        self._bounds = scipy.optimize.Bounds(
+            np.append(self.coordinates.low, -free), np.append(self.coordinates.high, free)
+        )
+
+    def found(self, v: Array) -> OutputPoint:
+        """What a point ``(..., size)`` is in units."""
+        z, noise, process, start = np.split(v, self._ends, axis=-1)
+        theta = self.coordinates.theta(torch.from_numpy(np.ascontiguousarray(z))).numpy()
+        first = self._first
+        return OutputPoint(
+            theta, first.noise * np.exp(noise), first.process * np.exp(process), first.start + self._spread * start
+        )
+
+    def loss(self, v: Array) -> Array:
+        """Minus the logarithm of the posterior at points ``(m, size)``, ``(m,)``: all are filtered side by side."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            _, likelihood, _ = filtered_outputs(self._model, self._data, self.found(v[:, None, :]), self._spread)
+        prior = 0.5 * np.sum((v / self._widths) ** 2, axis=1)
+        return np.asarray(np.nan_to_num(likelihood + prior, nan=1e12, posinf=1e12))
+
+    def _with_slope(self, v: Array) -> tuple[float, Array]:
+        steps = _STEP * np.eye(len(v))
+        inward = np.where(v + _STEP > self._bounds.ub, -1.0, 1.0)
+        values = self.loss(np.vstack([v, v + inward[:, None] * steps]))
+        return float(values[0]), inward * (values[1:] - values[0]) / _STEP
+
+    def best(self, seed: int) -> Array:
+        """The likeliest point, from several starts."""
+        rng, size = np.random.default_rng(seed), len(self._widths)
+        away = np.concatenate([np.full(self.coordinates.size, _AWAY), np.zeros(size - self.coordinates.size)])
+        starts = [np.zeros(size), *(away * rng.standard_normal(size) for _ in range(_STARTS - 1))]
+        starts[0][: self.coordinates.size] = self.coordinates.start
+        tried = [self._descended(np.clip(v, self._bounds.lb, self._bounds.ub), _FIRST_ITERATIONS) for v in starts]
+        return self._descended(min(tried, key=lambda each: each[1])[0], _ITERATIONS)[0]
+
+    def _descended(self, v: Array, iterations: int) -> tuple[Array, float]:
+        done = scipy.optimize.minimize(
+            self._with_slope, v, jac=True, method="L-BFGS-B", bounds=self._bounds, options={"maxiter": iterations}
+        )
+        return np.asarray(done.x), float(done.fun)
+
+    def curvature(self, v: Array) -> Array:
+        """The second derivative of the loss there, ``(size, size)``, by differences."""
+        step, n = 10.0 * _STEP, len(v)
+        pairs = [(i, j) for i in range(n) for j in range(i + 1)]
+        e = step * np.eye(n)
+        points = np.array([v + a * e[i] + b * e[j] for i, j in pairs for a in (1, -1) for b in (1, -1)])
+        values = np.concatenate([self.loss(part) for part in np.array_split(points, -(-len(points) // (4 * n)))])
+        second = values.reshape(-1, 4) @ np.array([1.0, -1.0, -1.0, 1.0]) / (4.0 * step**2)
+        found = np.zeros((n, n))
+        for (i, j), value in zip(pairs, second, strict=True):
+            found[i, j] = found[j, i] = value
+        return found
+
+
+def _first_start(given: KalmanObserver, data: OutputEpisodes) -> Array:
+    """The mean of the starts, of states that are measured as the log has it."""
+    start, outputs = given.start.copy(), data.y[0].mean(axis=0)
+    jacobian = np.asarray(given.function.jacobian()(start, 0).full())
+    for k, row in enumerate(jacobian):
+        if np.count_nonzero(row) == 1 and row.max() == 1.0:
+            start[int(np.argmax(row))] = outputs[k]
+    return start
+
+
+def _first_noise(data: OutputEpisodes) -> Array:
+    """What the second differences of outputs say of their noise: for a smooth motion all of it."""
+    second = np.diff(data.y, n=2, axis=0)
+    spread = np.nanstd(data.y, axis=(0, 1))
+    rough = np.nanstd(second, axis=(0, 1)) / np.sqrt(6.0) if len(second) else 0.1 * spread
+    return np.asarray(np.maximum(rough, 1e-3 * spread))
+
+
+def _listed(values: Any) -> str:
+    return ", ".join(f"{v:.3g}" for v in values)

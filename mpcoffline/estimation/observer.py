@@ -1,0 +1,233 @@
+"""States from outputs: an extended Kalman filter for an MPC's model, over many loops at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.component import numbers
+from mpcoffline.mpc.expressions import traced
+from mpcoffline.mpc.rest import at_rest
+
+#: Outputs: which states a sensor shows, or x ``(n_states, 1)`` -> y as a CasADi column.
+Outputs = Sequence[int] | Callable[[ca.SX], Any]
+
+_SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
+_RANDOM_WALK = 1e3  # steps, over which a disturbance of an unbounded input would have come about
+
+
+class Estimate(NamedTuple):
+    """What an observer knows.
+
+    Attributes:
+        x: States of the plant and disturbances of its inputs, ``(B, n)``.
+        P: The covariance of their errors, ``(B, n, n)``.
+    """
+
+    x: Array
+    P: Array
+
+
+class OutputModel:
+    """What an MPC's model says of outputs: the plant's map with constant disturbances of its inputs, and h.
+
+    Args:
+        mpc: Has the model.
+        outputs: Which states are measured, or a function of them.
+        n_disturbances: Of the first inputs, those with a disturbance.
+
+    Attributes:
+        function: h, x ``(n_states, 1)`` -> y.
+        n_outputs: Number of outputs.
+
+    Raises:
+        InvalidArgumentError: For outputs that are none of the states, or no expression.
+    """
+
+    def __init__(self, mpc: MPC, outputs: Outputs, n_disturbances: int = 0) -> None:
+        n, m = mpc.layout.n_states, n_disturbances
+        self.function = _outputs(outputs, n)
+        self.n_outputs = self.function.numel_out(0)
+        z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
+        theta = ca.SX.sym("theta", mpc.space.size)
+        disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
+        ahead, seen = ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:]), self.function(z[:n])
+        self._ahead = ca.Function("ahead", [z, acting, theta], [ahead, ca.densify(ca.jacobian(ahead, z))])
+        self._seen = ca.Function("seen", [z], [seen, ca.densify(ca.jacobian(seen, z))])
+        self._identity = np.eye(n + m)
+
+    def ahead(self, known: Estimate, acting: Array, theta: Array, Q: Array) -> tuple[Estimate, Array]:
+        """What is known a step later, before an output, and F ``(B, n, n)``.
+
+        A prediction that is no number leaves the states where they are, as uncertain as they would be then.
+
+        Args:
+            known: At the step.
+            acting: The inputs that act in it, and the present signals, ``(B, nu + n_signals)``.
+            theta: Parameters, ``(size,)``, or ``(B, size)``.
+            Q: Covariance of what the model misses, ``(n, n)`` or ``(B, n, n)``.
+        """
+        x, F = _called(self._ahead, known.x, acting, theta)
+        failed = ~(np.isfinite(x).all(axis=1) & np.isfinite(F).all(axis=(1, 2)))
+        if failed.any():
+            x[failed], F[failed] = known.x[failed], self._identity
+        return Estimate(x, F @ known.P @ F.swapaxes(1, 2) + Q), F
+
+    def corrected(self, known: Estimate, y: Array, R: Array) -> tuple[Estimate, Array, Array]:
+        """What is known with outputs y ``(B, n_outputs)``, the innovations, and their covariance S.
+
+        Outputs that are NaN are not there: their innovation is zero, and S that of the noise alone.
+
+        Args:
+            known: Before them.
+            y: The outputs.
+            R: Covariance of their noise, ``(n_outputs, n_outputs)`` or ``(B, n_outputs, n_outputs)``.
+        """
+        seen, H = _called(self._seen, known.x)
+        missing = ~np.isfinite(y)
+        innovation = y - seen
+        if missing.any():
+            innovation, H = np.where(missing, 0.0, innovation), np.where(missing[:, :, None], 0.0, H)
+        HP = H @ known.P
+        S = HP @ H.swapaxes(1, 2) + R
+        gain = np.linalg.solve(S, HP).swapaxes(1, 2)
+        left = self._identity - gain @ H
+        P = left @ known.P @ left.swapaxes(1, 2) + gain @ R @ gain.swapaxes(1, 2)
+        return Estimate(known.x + (gain @ innovation[:, :, None])[:, :, 0], P), innovation, S
+
+
+class KalmanObserver:
+    """An extended Kalman filter: estimates the plant's states from what sensors show of them.
+
+    ::
+
+        x-_{k+1} = f(x_k, u_k + d_k),   d-_{k+1} = d_k,        P- = F P F' + Q
+        K = P- H' (H P- H' + R)^-1,     x = x- + K (y - h(x-)),   P = (1 - K H) P- (1 - K H)' + K R K'
+
+    with d a constant disturbance of the inputs, where one is asked for: then there is no steady offset of the states
+    that are measured, though the model's gain be wrong or a load unknown (offset-free MPC: Muske and Badgwell,
+    doi:10.1016/S0959-1524(01)00051-8). Disturbances are told apart only where there are at least as many outputs.
+
+    Args:
+        mpc: Has the model.
+        outputs: Which states are measured, or a function of them.
+        noise: Standard deviation of the error of each output, ``(n_outputs,)`` or one for all.
+        process: Standard deviation of what the model misses of each state in a step, ``(n_states,)``; positive where
+            the model is not exact.
+        start: States where an episode begins, as far as is known before the first output, ``(n_states,)``. The
+            reference, or zero, by default.
+        start_spread: Standard deviation of their error, ``(n_states,)``.
+        disturbance: How much a disturbance of each input changes in a step, ``(nu,)``, standard deviation: larger is
+            faster, and noisier. None for none.
+
+    Attributes:
+        n_outputs: Number of outputs.
+
+    Raises:
+        InvalidArgumentError: For numbers that are negative, of another size or not finite, outputs that are none of the
+            states, noise of zero, or more disturbances than outputs.
+    """
+
+    def __init__(
+        self,
+        mpc: MPC,
+        outputs: Outputs,
+        noise: ArrayLike,
+        process: ArrayLike,
+        *,
+        start: ArrayLike | None = None,
+        start_spread: ArrayLike,
+        disturbance: ArrayLike | None = None,
+    ) -> None:
+        n = mpc.layout.n_states
+        self.mpc, self.n_disturbances = mpc, 0 if disturbance is None else mpc.nu
+        self._model = OutputModel(mpc, outputs, self.n_disturbances)
+        self.function, self.n_outputs, self._theta = self._model.function, self._model.n_outputs, mpc.theta
+        self.noise = _spreads("noise", noise, self.n_outputs, positive=True)
+        self.process = _spreads("process", process, n)
+        self.start = at_rest(mpc)[:n] if start is None else _vector("start", start, n)
+        self.start_spread = _spreads("start_spread", start_spread, n)
+        self.disturbance = None if disturbance is None else _spreads("disturbance", disturbance, mpc.nu)
+        if self.n_disturbances > self.n_outputs:
+            raise InvalidArgumentError(
+                "disturbance",
+                expected=f"at most as many inputs as outputs, {self.n_outputs}",
+                actual=f"{self.n_disturbances} inputs",
+                hint="More cannot be told apart. disturbance=None leaves them out.",
+            )
+        missed = self.process if self.disturbance is None else np.append(self.process, self.disturbance)
+        self._Q, self._R = np.diag(missed**2), np.diag(self.noise**2)
+
+    def begin(self, n_loops: int) -> Estimate:
+        """What is known before the first output of B loops."""
+        spread = self.start_spread
+        if self.disturbance is not None:
+            width = np.asarray(self.mpc.action_high) - np.asarray(self.mpc.action_low)
+            unbounded = self.disturbance * np.sqrt(_RANDOM_WALK)
+            spread = np.append(spread, np.where(np.isfinite(width), _SHARE * width, unbounded))
+        x = np.append(self.start, np.zeros(self.n_disturbances))
+        return Estimate(np.tile(x, (n_loops, 1)), np.tile(np.diag(spread**2), (n_loops, 1, 1)))
+
+    def ahead(self, known: Estimate, acting: Array) -> Estimate:
+        """What is known a step later, before an output.
+
+        Args:
+            known: At the step.
+            acting: The inputs that act in it, dead time past, and the present signals, as ``mpc.layout.split`` gives
+                them, ``(B, nu + n_signals)``.
+        """
+        return self._model.ahead(known, acting, self._theta, self._Q)[0]
+
+    def corrected(self, known: Estimate, y: Array) -> Estimate:
+        """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there."""
+        return self._model.corrected(known, y, self._R)[0]
+
+    def states(self, known: Estimate) -> Array:
+        """The plant's states, ``(B, n_states)``."""
+        return known.x[:, : self.mpc.layout.n_states]
+
+    def disturbances(self, known: Estimate) -> Array:
+        """The disturbances of its inputs, ``(B, nu)``; zero where none are estimated."""
+        found = known.x[:, self.mpc.layout.n_states :]
+        return found if self.n_disturbances else np.zeros((len(found), self.mpc.nu))
+
+
+def _outputs(outputs: Outputs, n: int) -> ca.Function:
+    x = ca.SX.sym("x", n)
+    if callable(outputs):
+        y = ca.SX(ca.vertcat(*outputs(x)) if isinstance(outputs, (list, tuple)) else outputs(x))
+        return traced("outputs", ca.Function("outputs", [x], [ca.densify(y)]))
+    places = list(outputs)
+    if not places or not all(isinstance(i, (int, np.integer)) and 0 <= i < n for i in places):
+        raise InvalidArgumentError("outputs", expected=f"places of states, 0 to {n - 1}", actual=str(places))
+    return ca.Function("outputs", [x], [x[[int(i) for i in places]]])
+
+
+def _called(function: ca.Function, *arguments: Array) -> tuple[Array, Array]:
+    """A function of columns and its Jacobian at rows of arguments ``(B, ...)``: ``(B, m)`` and ``(B, m, n)``."""
+    value, slopes = function(*(argument.T if argument.ndim > 1 else argument for argument in arguments))
+    m, B = value.shape
+    return np.array(value.full().T), np.array(slopes.full().reshape(m, B, -1).swapaxes(0, 1))
+
+
+def _vector(name: str, given: ArrayLike, size: int) -> Array:
+    values = np.asarray(numbers(name, given), dtype=np.float64)
+    if values.shape not in ((), (size,)):
+        raise InvalidArgumentError(name, expected=f"a number, or {size}", actual=f"shape {values.shape}")
+    return np.array(np.broadcast_to(values, (size,)))
+
+
+def _spreads(name: str, given: ArrayLike, size: int, *, positive: bool = False) -> Array:
+    values = _vector(name, given, size)
+    if not (np.isfinite(values).all() and (values > 0.0 if positive else values >= 0.0).all()):
+        raise InvalidArgumentError(
+            name, expected=f"standard deviations, {'positive' if positive else 'none below zero'}", actual=str(values)
+        )
+    return values

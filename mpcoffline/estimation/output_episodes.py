@@ -1,0 +1,205 @@
+"""Logged episodes of outputs: filtered and smoothed side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
+from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC
+
+from .observer import Estimate, OutputModel
+
+_CHUNK = 200  # episodes smoothed at a time
+
+
+class OutputPoint(NamedTuple):
+    """What a filter needs to know, in units; or several, ``(m, 1, ...)``.
+
+    Attributes:
+        theta: All parameters of the MPC, ``(size,)``.
+        noise: Standard deviation of each output's error, ``(n_outputs,)``.
+        process: That of what the model misses of each state, ``(n_states,)``.
+        start: Mean of the first states, ``(n_states,)``.
+    """
+
+    theta: Array
+    noise: Array
+    process: Array
+    start: Array
+
+
+class OutputEpisodes(NamedTuple):
+    """Episodes side by side, padded to one length, time first.
+
+    Attributes:
+        y: Outputs, NaN behind the end, ``(T + 1, E, n_outputs)``.
+        acting: What acts in each step, ``(T, E, nu + n_signals)``.
+        lengths: Steps of each, ``(E,)``.
+        rows: Its first row in the table, ``(E,)``.
+    """
+
+    y: Array
+    acting: Array
+    lengths: NDArray[np.intp]
+    rows: NDArray[np.intp]
+
+    def some(self, rows: int, longest: int, seed: int) -> OutputEpisodes:
+        """Beginnings of random episodes, about this many rows, of so many steps at most where these suffice."""
+        order = np.random.default_rng(seed).permutation(len(self.lengths))
+        longest = max(longest, rows // len(order))
+        lengths = np.minimum(self.lengths, longest)
+        chosen = np.sort(order[: max(1, int(np.searchsorted(np.cumsum(lengths[order]), rows)) + 1)])
+        T = int(lengths[chosen].max())
+        y = self.y[: T + 1, chosen].copy()
+        y[np.arange(T + 1)[:, None] > lengths[chosen]] = np.nan
+        return OutputEpisodes(y, self.acting[:T, chosen], lengths[chosen], self.rows[chosen])
+
+
+def output_episodes(mpc: MPC, log: TransitionTable, n_outputs: int) -> OutputEpisodes:
+    """The episodes of a log whose observations are outputs, then signals.
+
+    Raises:
+        InvalidArgumentError: For another number of columns.
+        InvalidDataError: If an output never moves, or episodes are too short to see a state in them.
+    """
+    layout, columns = mpc.layout, log.values()
+    expected = n_outputs + layout.ny - layout.n_states
+    if log.ny != expected or log.nu != layout.nu:
+        raise InvalidArgumentError(
+            "log",
+            expected=f"{n_outputs} outputs, {expected - n_outputs} columns of signals and {layout.nu} inputs",
+            actual=f"{log.ny} observations and {log.nu} actions",
+        )
+    _, firsts, lengths = log.episodes
+    order = np.argsort(firsts)
+    firsts, lengths = firsts[order], lengths[order]
+    least = -(-layout.n_states // n_outputs)
+    if int(lengths.max()) < least:
+        raise InvalidDataError(
+            "log",
+            expected=f"episodes of {least} steps at least, to see {layout.n_states} states in",
+            actual=str(lengths),
+        )
+    still = np.flatnonzero(np.ptp(columns.observations[:, :n_outputs], axis=0) == 0.0)
+    if len(still):
+        raise InvalidDataError(
+            "log", expected="outputs that move", actual=f"output {still[0]} is one number throughout"
+        )
+    T, E = int(lengths.max()), len(lengths)
+    y, acting = np.full((T + 1, E, n_outputs), np.nan), np.zeros((T, E, len(layout.acting)))
+    usual = mpc.usual_input
+    for e, (first, length) in enumerate(zip(firsts, lengths, strict=True)):
+        rows = slice(first, first + length)
+        y[:length, e] = columns.observations[rows, :n_outputs]
+        y[length, e] = columns.next_observations[first + length - 1, :n_outputs]
+        for i, delay in enumerate(layout.delay):
+            late = np.concatenate([np.full(delay, usual[i]), columns.actions[rows, i]])[:length]
+            acting[:length, e, i] = late
+        present = layout.present - layout.n_states + n_outputs
+        acting[:length, e, layout.nu :] = columns.observations[rows][:, present]
+    return OutputEpisodes(y, acting, np.asarray(lengths, dtype=np.intp), np.asarray(firsts, dtype=np.intp))
+
+
+def filtered_outputs(
+    model: OutputModel, data: OutputEpisodes, found: OutputPoint, spread: Array
+) -> tuple[list[Estimate], Array, list[tuple[Estimate, Array]]]:
+    """The filter over all stretches: estimates at each step, minus the log likelihood, predictions with their F.
+
+    Points ``(m, 1, size)`` in place of one are filtered side by side; then the likelihood is ``(m,)``.
+    """
+    T, E = data.acting.shape[:2]
+    lead = found.theta.shape[:-2]
+    m = int(np.prod(lead)) if lead else 1
+
+    def every(values: Array) -> Array:
+        """One row for each stretch of each point."""
+        rows = values.reshape(m, 1, -1) if lead else values.reshape(1, 1, -1)
+        return np.broadcast_to(rows, (m, E, rows.shape[-1])).reshape(m * E, -1)
+
+    def diagonal(values: Array) -> Array:
+        return every(values)[:, :, None] ** 2 * np.eye(values.shape[-1])
+
+    theta, Q, R = every(found.theta), diagonal(found.process), diagonal(found.noise)
+    known = Estimate(every(found.start).copy(), np.tile(np.diag(spread**2), (m * E, 1, 1)))
+    likelihood, history, ahead = np.zeros(m), [], []
+    for k in range(T + 1):
+        y = np.tile(data.y[k], (m, 1))
+        known, innovation, S = model.corrected(known, y, R)
+        heard = np.isfinite(y)
+        whitened = np.linalg.solve(S, innovation[:, :, None])[:, :, 0]
+        # Of outputs that are not there, S holds the noise alone, which is no evidence.
+        silent = np.where(heard, 0.0, np.log(np.einsum("bii->bi", R))).sum(axis=1)
+        term = np.einsum("bi,bi->b", innovation, whitened) + np.linalg.slogdet(S)[1] - silent
+        likelihood += 0.5 * term.reshape(m, E).sum(axis=1)
+        history.append(known)
+        if k < T:
+            known, F = model.ahead(known, np.tile(data.acting[k], (m, 1)), theta, Q)
+            ahead.append((known, F))
+    return history, likelihood if lead else likelihood[:1], ahead
+
+
+def smoothed_states(
+    model: OutputModel, data: OutputEpisodes, found: OutputPoint, spread: Array
+) -> tuple[list[Array], Array]:
+    """States of each episode, ``(length + 1, n_states)`` each, and the share of each variance that outputs remove.
+
+    That is, in the later half of an episode, of the variance that there would be without them.
+    """
+    states: list[Array] = []
+    left, without, Q = np.zeros(len(spread)), np.zeros(len(spread)), np.diag(found.process**2)
+    for part in _parts(data):
+        history, _, ahead = filtered_outputs(model, part, found, spread)
+        blind = np.tile(np.diag(spread**2), (len(part.lengths), 1, 1))
+        for k, known in enumerate(history):
+            late = (k <= part.lengths) & (2 * k >= part.lengths)
+            left += np.einsum("bii->bi", known.P)[late].sum(axis=0)
+            without += np.einsum("bii->bi", blind)[late].sum(axis=0)
+            if k < len(ahead):
+                blind = ahead[k][1] @ blind @ ahead[k][1].swapaxes(1, 2) + Q
+        x = [known.x for known in history]
+        for k in range(len(part.acting) - 1, -1, -1):
+            predicted, F = ahead[k]
+            gain = np.linalg.solve(predicted.P + _ridge(predicted.P), F @ history[k].P).swapaxes(1, 2)
+            going = (k < part.lengths)[:, None]
+            x[k] = x[k] + np.where(going, (gain @ (x[k + 1] - predicted.x)[:, :, None])[:, :, 0], 0.0)
+        whole = np.stack(x)
+        states += [whole[: length + 1, i] for i, length in enumerate(part.lengths)]
+    share = np.divide(left, without, out=np.zeros_like(left), where=without > 0.0)
+    return states, 1.0 - np.clip(np.nan_to_num(share), 0.0, 1.0)
+
+
+def _ridge(P: Array) -> Array:
+    """What keeps a covariance of an exact model regular."""
+    return np.asarray(1e-12 * np.einsum("bii->b", P)[:, None, None] * np.eye(P.shape[-1]))
+
+
+def _parts(data: OutputEpisodes) -> Iterator[OutputEpisodes]:
+    """Some episodes at a time, of like length, in their order."""
+    for begin in range(0, len(data.lengths), _CHUNK):
+        some = slice(begin, begin + _CHUNK)
+        T = int(data.lengths[some].max())
+        yield OutputEpisodes(data.y[: T + 1, some], data.acting[:T, some], data.lengths[some], data.rows[some])
+
+
+def with_states(log: TransitionTable, states: list[Array], data: OutputEpisodes, n_outputs: int) -> TransitionTable:
+    """The log with states in place of outputs."""
+    columns, n = log.values(), states[0].shape[1]
+    s, after = np.empty((len(log), n)), np.empty((len(log), n))
+    for first, length, x in zip(data.rows, data.lengths, states, strict=True):
+        s[first : first + length], after[first : first + length] = x[:-1], x[1:]
+    signals, later = (part[:, n_outputs:] for part in (columns.observations, columns.next_observations))
+    return TransitionTable.from_arrays(
+        np.hstack([s, signals]),
+        columns.actions,
+        columns.costs,
+        np.hstack([after, later]),
+        columns.terminations,
+        log.episode_ids,
+        name=log.name,
+    )
