@@ -134,7 +134,8 @@ def diagnose(
     rows, acting = around.rows[usual], clone.replaying(deviations[usual])
     paid, trust = logs if around.cost.limits is None else around.cost.limits.whole(logs), None
     if len(rows):
-        trust = _trust(agreement(around.models, around.cost, paid, acting, rows, around.n_steps), trials.votes)
+        agreed = agreement(around.models, around.cost, paid, acting, rows, around.n_steps, around.cost.ends.paid)
+        trust = _trust(agreed, trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     plain, priced = (clean, clean) if cost.limits is None else (cost.limits.without(clean), cost.limits.whole(clean))
     shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)

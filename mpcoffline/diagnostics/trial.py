@@ -307,7 +307,7 @@ def _levels(
     if not votes.any() or not len(rows) or not whole.all():
         return 0.0
     acting = clone.replaying(clone.deviations(table, rows, around.n_steps))
-    found = agreement(around.models, around.cost, table, acting, rows, around.n_steps)
+    found = agreement(around.models, around.cost, table, acting, rows, around.n_steps, around.cost.ends.paid)
     return float(np.median((found.simulated - found.logged).mean(axis=1)[votes]))
 
 

@@ -195,6 +195,7 @@ def agreement(
     policy: Any,
     rows: NDArray[np.intp],
     n_steps: int,
+    paid: Callable[[Array], Array] | None = None,
 ) -> Agreement:
     """Simulates the controller of the log on the models, from its own states, and compares the costs.
 
@@ -207,6 +208,8 @@ def agreement(
         policy: What acts, :meth:`Behaviour.replaying` of these rows and steps.
         rows: Starts, ``(s,)``.
         n_steps: Steps; fewer where an episode ends before.
+        paid: What the step that ends an episode costs more, by the states that it reaches ``(B, nx)``; nothing by
+            default.
     """
     layout, columns = models.layout, table.values()
     steps, goes_on = stretches(table, rows, n_steps)
@@ -221,6 +224,9 @@ def agreement(
         following[:, :, outside] = signals[:, k]
         stage = cost(x.reshape(-1, table.ny), u, following.reshape(-1, table.ny)).reshape(simulated.shape)
         simulated += np.where(goes_on[:, k], np.nan_to_num(stage, nan=dearest, posinf=dearest), 0.0)
+        ends = np.flatnonzero(goes_on[:, k] & (columns.terminations[steps[:, k]] > 0.0))
+        if paid is not None and len(ends):
+            simulated[:, ends] += paid(following[:, ends].reshape(-1, table.ny)).reshape(len(models), -1)
         x = following
     logged = np.where(goes_on, columns.costs[steps], 0.0).sum(axis=1)
     return Agreement(simulated, logged, cost_spread(columns.costs) * float(goes_on.sum(axis=1).mean()))

@@ -11,6 +11,8 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 
+from .end_prices import EndPrices
+
 _OTHERS = 20_000  # states that did not end an episode and are looked at
 _LEAST = 0.1  # share of the ends that another limit must explain
 _PLAIN = 0.9  # share of what the score explains that suffices for a limit of one coordinate
@@ -26,6 +28,9 @@ class Ends:
         wrong: Share of what lies beyond one that did not end an episode.
         price: What the step costs that ends an episode, more than the same step elsewhere; a median.
         count: Number of logged ends.
+        prices: The same by the state that the step reaches; None where one number says as much.
+        good_below: A price below which an end is a good one, as a goal reached: cheaper than other steps by more than
+            half of what these differ; where all cost the same, than half of such a step.
     """
 
     limits: tuple[tuple[int, float, float], ...] = ()
@@ -35,6 +40,8 @@ class Ends:
     count: int = 0
     features: RandomFeatures | None = None
     weights: Ridge | None = None
+    prices: EndPrices | None = None
+    good_below: float = -np.inf
 
     def __call__(self, reached: Array) -> NDArray[np.bool_]:
         """Whether states s+ ``(n, d)`` end an episode, ``(n,)``."""
@@ -46,6 +53,10 @@ class Ends:
                 ended |= self.weights(self.features(reached))[:, 0] > value
         return ended
 
+    def paid(self, reached: Array) -> Array:
+        """The prices of ends in states s+ ``(n, d)``, ``(n,)``."""
+        return np.full(len(reached), self.price) if self.prices is None else self.prices(reached)
+
     def __str__(self) -> str:
         """In words; empty where no episode of the log was ended."""
         if not self.count:
@@ -56,6 +67,8 @@ class Ends:
         if self.features is not None:
             said = [*said[:-1], "a quadratic of the states says so"]
         price = f", at {self.price:.4g} more than elsewhere" if self.price else ""
+        if self.prices is not None:
+            price = f", at {self.prices.low:.4g} to {self.prices.high:.4g} more than elsewhere, by {self.prices.kind}"
         return f"episodes end where {' or '.join(said)} ({self.found:.0%} of {self.count} logged ends){price}"
 
 
@@ -78,7 +91,7 @@ def learned_ends(table: TransitionTable, prices: Array, seed: int, seen: int) ->
     last, others = np.flatnonzero(over), np.flatnonzero(~over)
     others = others if len(others) <= _OTHERS else np.sort(rng.permutation(others)[:_OTHERS])
     bad, good = (np.asarray(table.take(rows).next_observations[:, :seen], dtype=np.float64) for rows in (last, others))
-    price, count = float(np.median(prices)), len(last)
+    price, count, by_state = float(np.median(prices)), len(last), EndPrices.of(bad, prices, seed)
     plain = _limits(bad, good)
     features = RandomFeatures(np.vstack([bad, good]), 0, rng)
     weights = _score(features, bad, good)
@@ -88,7 +101,20 @@ def learned_ends(table: TransitionTable, prices: Array, seed: int, seen: int) ->
     else:
         found = Ends(plain, price=price, count=count)
     hits, false = int(found(bad).sum()), int(found(good).sum())
-    return Ends(found.limits, hits / count, false / max(hits + false, 1), price, count, found.features, found.weights)
+    shares = hits / count, false / max(hits + false, 1)
+    good = _good_below(table.take(np.flatnonzero(~over)))
+    return Ends(found.limits, *shares, price, count, found.features, found.weights, by_state, good)
+
+
+def _good_below(going: TransitionTable) -> float:
+    """See :class:`Ends`; of the steps that end no episode.
+
+    Of a plant whose every step costs 1 an end without a price is a goal, where each is paid 1 it is a loss. Elsewhere
+    an end without a price may be a plant that was switched off far out: no good one.
+    """
+    costs = going.values().costs
+    low, high = float(costs.min()), float(costs.max())
+    return 0.5 * low if low == high else -0.5 * (high - low)
 
 
 def _limits(bad: Array, good: Array) -> tuple[tuple[int, float, float], ...]:

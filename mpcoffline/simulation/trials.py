@@ -55,7 +55,7 @@ class Trials:
         votes: Which models predict the log well enough to be asked, ``(models,)``.
         cost: Undiscounted cost of each episode, in the unit of the logged costs; NaN where it was not tried.
         second: The same with another regression of the logged cost.
-        lost: Whether the state ran away, or the episode ended as bad ones do.
+        lost: Whether the state ran away, or the episode ended, but at a goal.
         rows: The row of the log that each start is, ``(starts,)``.
         returns: What the log itself cost from there over as many steps, ``(starts,)``; NaN where it ends before.
         begun: The starts at which an episode of the log began, ``(starts,)``.
@@ -281,7 +281,7 @@ class Surroundings:
         noise, disturbances = self.noise[:, starts], self.disturbances[:, starts]
         shape = m, c, len(begun)  # a row of states for each
         x = np.broadcast_to(begun, (*shape, begun.shape[1])).copy()
-        lost, over = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        lost, over, good = (np.zeros(shape, dtype=bool) for _ in range(3))
         total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
         states_kept, actions_kept = [x[:, :, :kept].copy()], []
         courses = [self._course(controller, x[:, i], self.begun[starts]) for i, controller in enumerate(controllers)]
@@ -299,8 +299,11 @@ class Surroundings:
             for costs, function in ((total, self.cost), (second, self.cost.second)):
                 costs += np.where(over, 0.0, np.where(lost, self._dearest, function(*steps).reshape(shape)))
             ended = self.cost.ended(*steps).reshape(shape) & ~lost & ~over
-            total += np.where(ended, self.cost.end_price, 0.0)
-            second += np.where(ended, self.cost.end_price, 0.0)
+            if ended.any():
+                paid = self.cost.ends.paid(reached[ended])
+                total[ended] += paid
+                second[ended] += paid
+                good[ended] = paid < self.cost.ends.good_below
             over |= ended
             lost |= ~(np.abs(reached - self._middle) < self._reach).all(axis=-1) & ~over
             x = np.where((lost | over)[..., None], x, reached)
@@ -309,7 +312,7 @@ class Surroundings:
             actions.append(u[0])
             states_kept.append(x[:, :, :kept].copy())
             actions_kept.append(u[:, :, :kept].copy())
-        lost |= over
+        lost |= over & ~good
         parts = np.stack(states, axis=2), np.stack(actions, axis=2)
         kept_parts = np.stack(states_kept, axis=3), np.stack(actions_kept, axis=3)
         return [

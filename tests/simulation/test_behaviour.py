@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import lq_plant
 import numpy as np
 import pytest
@@ -90,15 +92,17 @@ def test_inputs_that_never_vary_and_one_row_are_cloned() -> None:
     assert Behaviour.of(table.take(slice(0, 1)), PLAIN).predict(np.ones((1, 2)))[0].tolist() == [[0.25]]
 
 
-def agreeing(mpc: MPC, table: TransitionTable) -> tuple[LogModels, Agreement]:
+def agreeing(
+    mpc: MPC, table: TransitionTable, paid: Callable[[Array], Array] | None = None
+) -> tuple[LogModels, Agreement]:
     models = LogModels.of(mpc, table, identify_one_step(mpc, table), n_perturbed=0, n_residual=0)
     clone, rows = Behaviour.of(table, PLAIN), table.episodes.firsts[:8]
     policy = clone.replaying(clone.deviations(table, rows, 30))
 
-    def cost(x: Array, u: Array) -> Array:
+    def cost(x: Array, u: Array, _: Array) -> Array:
         return lq_plant.quadratic(lq_plant.W, x) + lq_plant.quadratic(lq_plant.R, u)
 
-    return models, agreement(models, cost, table, policy, rows, 30)
+    return models, agreement(models, cost, table, policy, rows, 30, paid)
 
 
 def test_the_right_model_reproduces_the_costs_of_the_log_and_a_wrong_one_does_not() -> None:
@@ -111,6 +115,19 @@ def test_the_right_model_reproduces_the_costs_of_the_log_and_a_wrong_one_does_no
     assert right.logged[0] == pytest.approx(first, rel=1e-5)
     _, wrong = agreeing(lq_plant.make_mpc((lq_plant.A + 0.05, lq_plant.B)), table)
     assert wrong.scatters[0] > 0.1
+
+
+def test_what_an_end_costs_is_part_of_what_models_say_of_the_log() -> None:
+    plain = episodes(n=40, steps=30)
+    columns, last = plain.values(), np.zeros(len(plain), dtype=bool)
+    last[plain.episodes.firsts + plain.episodes.lengths - 1] = True
+    parts = columns.observations, columns.actions, columns.costs + 7.0 * last, columns.next_observations, last
+    table = TransitionTable.from_arrays(*parts, plain.episode_ids)
+    mpc = lq_plant.make_mpc((lq_plant.A, lq_plant.B))
+    _, without = agreeing(mpc, table)
+    _, found = agreeing(mpc, table, lambda s: np.full(len(s), 7.0))
+    np.testing.assert_allclose(found.simulated[0], found.logged, rtol=1e-3)
+    np.testing.assert_allclose(without.logged - without.simulated[0], 7.0, rtol=1e-2)
 
 
 def test_returns_are_those_of_the_episodes_with_their_spread() -> None:
