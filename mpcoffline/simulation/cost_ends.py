@@ -102,8 +102,8 @@ def learned_ends(table: TransitionTable, prices: Array, seed: int, seen: int) ->
         found = Ends(plain, price=price, count=count)
     hits, false = int(found(bad).sum()), int(found(good).sum())
     shares = hits / count, false / max(hits + false, 1)
-    good = _good_below(table.take(np.flatnonzero(~over)))
-    return Ends(found.limits, *shares, price, count, found.features, found.weights, by_state, good)
+    good_below = _good_below(table.take(np.flatnonzero(~over)))
+    return Ends(found.limits, *shares, price, count, found.features, found.weights, by_state, good_below)
 
 
 def _good_below(going: TransitionTable) -> float:
