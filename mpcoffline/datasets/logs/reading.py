@@ -39,7 +39,6 @@ class LoggedTable(TransitionTable):
     Attributes:
         report: What became of the log.
         action_bounds: Bounds of the inputs, ``(nu,)`` each.
-        names: Names and units of its columns, observations first.
         options: As what it was read.
         header: Names of the first log's columns.
     """
@@ -48,11 +47,6 @@ class LoggedTable(TransitionTable):
     options: Options
     header: list[str]
     action_bounds: tuple[Array, Array]
-    names: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        """Its log and columns."""
-        return f"LoggedTable({self.name!r}, n={len(self)}; {', '.join(self.names)})"
 
     def to_minari(self, dataset_id: str, *, overwrite: bool = False) -> MinariDataset:
         """Stores the log as a Minari data set.
@@ -76,11 +70,8 @@ class LoggedTable(TransitionTable):
             for p in parts
         ]
         low, high = self.action_bounds
-        s, a = (", ".join(names) for names in (self.names[: self.ny], self.names[self.ny :]))
-        text = f"Log {self.name}. Observations: {s}. Actions: {a}."
-        return dataset_from_arrays(
-            dataset_id, episodes, action_low=low, action_high=high, description=text, overwrite=overwrite
-        )
+        how: dict[str, Any] = {"description": f"Log {self.name}.", "names": self.names, "overwrite": overwrite}
+        return dataset_from_arrays(dataset_id, episodes, action_low=low, action_high=high, **how)
 
 
 def read_log(sources: Any, wanted: Wanted, options: Options) -> LoggedTable:

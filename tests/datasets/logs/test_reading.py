@@ -431,6 +431,7 @@ def test_the_log_becomes_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     table = plant.read({"h1": LOG.h1, "h2": LOG.h2, "pump": LOG.pump, "set_point": LOG.set_point})
     again = TransitionTable.from_minari(table.to_minari("mine/tanks/log-v0"))
+    assert again.names == table.names == ("h1 [cm]", "h2 [cm]", "set_point [cm]", "pump [V]")
     np.testing.assert_allclose(again.values().next_observations, table.values().next_observations, rtol=1e-6)
     np.testing.assert_array_equal(again.episode_ids, table.episode_ids)
 
