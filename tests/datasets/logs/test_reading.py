@@ -404,6 +404,34 @@ def test_temperatures_have_an_offset(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows.costs, [1.0, 0.0], atol=1e-5)
 
 
+def german(log: Any, tags: str = "LI101 Oben [mm];LI102 Unten [cm];SC100 Pumpe [V];LC102 Sollwert [cm]") -> str:
+    """A log whose rows have text at both ends, so that a comma leaves no number whole."""
+    rows = [f"Zeit;{tags};Betriebsart"]
+    for k, values in enumerate(zip(10 * log.h1, log.h2, log.pump, log.set_point, strict=True)):
+        numbers = [f"{value:.3f}".replace(".", ",") for value in values]
+        rows.append(
+            ";".join([f"02.03.2026 06:{5 * k // 60:02}:{5 * k % 60:02}", *numbers, "HAND" if k < 2 else "AUTO"])
+        )
+    return "\n".join(rows) + "\n"
+
+
+def test_text_at_both_ends_of_a_row_hides_no_decimal_comma(tmp_path: Path, plant: Plant) -> None:
+    columns = {"h1": "LI101", "h2": "LI102", "pump": "SC100", "set_point": "lc102 Sollwert"}
+    table = plant.read(written(tmp_path, german(LOG)), columns=columns, where={"Betriebsart": "AUTO"})
+    np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[2:-1], atol=1e-3)
+    np.testing.assert_allclose(table.values().actions[:, 0], LOG.pump[2:-1], atol=1e-3)
+
+
+def test_a_tag_of_two_columns_is_none_of_them(tmp_path: Path, plant: Plant) -> None:
+    log = written(tmp_path, german(LOG, "LI101 Oben [mm];LI101 Unten [cm];SC100 Pumpe [V];LC102 Sollwert [cm]"))
+    names = {"h2": "LI101 Unten", "pump": "SC100", "set_point": "LC102"}
+    with pytest.raises(InvalidDataError, match=r"column 'LI101': expected one column of that name, got 2: 'LI101 Oben"):
+        plant.read(log, columns={"h1": "LI101", **names})
+    with pytest.raises(InvalidDataError, match=r"columns of 'h1', 'LI10': .*Is it 'LI101") as refused:
+        plant.read(log, columns={**names, "h2": "LI10"})
+    assert "Zeit'?" not in str(refused.value)
+
+
 def test_previews_and_clocks_come_from_the_log() -> None:
     plant = two_tanks(signals=[Signal("set_point", "cm", preview=2), Signal("day", period=17280)])
     t = stamps(LOG)
