@@ -44,7 +44,11 @@ Logs = Annotated[
 ]
 Columns = Annotated[
     list[str] | None,
-    typer.Option("--column", metavar="NAME=HEADER", help="A header that is not the plant's name; repeatable."),
+    typer.Option(
+        "--column",
+        metavar="NAME=HEADER",
+        help="A header that is not the plant's name, or its first word; repeatable. In a plant file: columns={...}.",
+    ),
 ]
 Units = Annotated[
     list[str] | None,

@@ -161,7 +161,8 @@ def _noise(plant: Plant, found: LogCheck) -> None:
     if identified is None:
         return
     noise = identified.noise
-    parts = [f"{q.name} {v:.2g} {q.unit}".rstrip() for q, v in zip(plant.states, noise.measurement, strict=True)]
+    sizes = [(q, f"{v:.2g} {q.unit}" if v > 0.0 else "") for q, v in zip(plant.states, noise.measurement, strict=True)]
+    parts = [f"{q.name} {size or 'none that shows'}".rstrip() for q, size in sizes]
     found.add("good", "noise", f"of the measurements, standard deviation: {', '.join(parts)}")
     if noise.increments is None:
         return

@@ -36,12 +36,14 @@ class Quantity(NamedTuple):
         unit: The unit that it is wanted in; empty where any will do.
         low: The least that it may be.
         high: The largest.
+        header: What logs usually call its column, where that is not its name; a column of its name is it, too.
     """
 
     name: str
     unit: str = ""
     low: float = -np.inf
     high: float = np.inf
+    header: str = ""
 
 
 class Found(NamedTuple):
@@ -146,7 +148,7 @@ def found(
         if other := [name for name in given if name not in known]:
             raise InvalidArgumentError(argument, expected=f"names among {', '.join(known)}", actual=repr(other[0]))
     result: dict[str, Found] = {}
-    places = _places(source, known, columns)
+    places = _places(source, quantities, columns)
     for each in quantities:
         place, unit = places[each.name]
         unit, header = units.get(each.name, unit), source.header[place]
@@ -161,18 +163,33 @@ def found(
     return result
 
 
-def _places(source: Source, names: Sequence[str], columns: Mapping[str, str]) -> dict[str, tuple[int, str | None]]:
+def _placed(source: Source, each: Quantity, given: str | None) -> tuple[int, str | None]:
+    """The column of a quantity: as the user says, as its description says, or by its name."""
+    if given is not None or not each.header:
+        return place_of(source, each.name, given)
+    try:
+        return place_of(source, each.name, each.header)
+    except MissingColumnError as error:
+        try:
+            return place_of(source, each.name, None)
+        except MissingColumnError:
+            raise error from None
+
+
+def _places(
+    source: Source, quantities: Sequence[Quantity], columns: Mapping[str, str]
+) -> dict[str, tuple[int, str | None]]:
     """The column of each name and its unit; all names that have none are told at once.
 
     Raises:
         InvalidDataError: If some have none, or more than one.
     """
-    result, missing = {}, {}
-    for name in names:
+    result, missing, said_so = {}, {}, {each.name: each.header or each.name for each in quantities} | dict(columns)
+    for each in quantities:
         try:
-            result[name] = place_of(source, name, columns.get(name))
+            result[each.name] = _placed(source, each, columns.get(each.name))
         except MissingColumnError as error:
-            missing[name] = error
+            missing[each.name] = error
     if not missing:
         return result
     first = next(iter(missing.values()))
@@ -181,7 +198,7 @@ def _places(source: Source, names: Sequence[str], columns: Mapping[str, str]) ->
     guesses = [f"{name}: {error.hint.partition('?')[0]}?" for name, error in missing.items() if "?" in error.hint]
     said = f"{' '.join(guesses)} " if guesses else ""
     raise MissingColumnError(
-        f"{source.name}: columns of {', '.join(repr(columns.get(name, name)) for name in missing)}",
+        f"{source.name}: columns of {', '.join(repr(said_so[name]) for name in missing)}",
         expected=first.expected,
         actual="none of them",
         hint=f"{said}columns={{{next(iter(missing))!r}: ..., ...}} says which (--column {next(iter(missing))}=...).",

@@ -13,6 +13,7 @@ from tank_logs import START, Log, simulated, stamps, text
 from two_tanks import two_tanks
 
 from mpcoffline import (
+    FileFormatError,
     Input,
     InvalidArgumentError,
     InvalidDataError,
@@ -22,6 +23,9 @@ from mpcoffline import (
     State,
     StorageError,
 )
+from mpcoffline.datasets.logs.collecting import Options
+from mpcoffline.datasets.logs.reading import read_log
+from mpcoffline.datasets.logs.wanted import Wanted
 
 pl = pytest.importorskip("polars")
 LOG = simulated()
@@ -420,6 +424,27 @@ def test_text_at_both_ends_of_a_row_hides_no_decimal_comma(tmp_path: Path, plant
     table = plant.read(written(tmp_path, german(LOG)), columns=columns, where={"Betriebsart": "AUTO"})
     np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[2:-1], atol=1e-3)
     np.testing.assert_allclose(table.values().actions[:, 0], LOG.pump[2:-1], atol=1e-3)
+
+
+def test_a_description_says_what_logs_call_its_columns(tmp_path: Path) -> None:
+    described = two_tanks(columns={"h1": "LI101", "h2": "LI102", "pump": "SC100", "set_point": "LC102"})
+    for reader in (described.wanted, Wanted.from_json(described.wanted.to_json(described.cost_function))):
+        table = read_log(written(tmp_path, german(LOG)), reader, Options(where={"Betriebsart": "AUTO"}))
+        np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[2:-1], atol=1e-3)
+    assert len(described.read(written(tmp_path, text(LOG)))) == len(two_tanks().read(written(tmp_path, text(LOG))))
+    both = german(LOG).replace("LI102 Unten [cm]", "h1 [cm]")  # a column of its name is another one here
+    table = described.read(written(tmp_path, both), columns={"h2": "h1"})
+    np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[:-1], atol=1e-3)
+    with pytest.raises(InvalidDataError, match="column 'LI102': expected one among 'Zeit', "):
+        described.read(written(tmp_path, german(LOG).replace("LI102", "XX")))
+    with pytest.raises(InvalidArgumentError, match=r"columns: expected one of .*got 'h3'"):
+        two_tanks(columns={"h3": "LI103"})
+    with pytest.raises(InvalidArgumentError, match="columns: h1: expected a header of up to 200 characters"):
+        two_tanks(columns={"h1": " "})
+    wrong = described.wanted.to_json(described.cost_function)
+    wrong["states"][0]["header"] = "x" * 201
+    with pytest.raises(FileFormatError, match="header of h1"):
+        Wanted.from_json(wrong)
 
 
 def test_a_tag_of_two_columns_is_none_of_them(tmp_path: Path, plant: Plant) -> None:
