@@ -147,8 +147,8 @@ def check(
 
         plant = load_plant(file)
         table = plant.read(logs, **options)
-    with working("Comparing them"):
-        found = check_log(plant, table, seed=seed)
+    with working("Comparing them") as status:
+        found = check_log(plant, table, seed=seed, tell=lambda what: status.update(f"Comparing them: {what}"))
     if as_json:
         print_json(_document(plant, table, found))
     else:
