@@ -10,9 +10,11 @@ from __future__ import annotations
 import difflib
 import io
 import json
+import logging
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,6 +133,17 @@ def print_json(document: Any) -> None:
 def working(what: str) -> Status:
     """A sign of life on a terminal while something loads or is computed; to be entered before what it is a sign of."""
     return messages.status(what)
+
+
+@contextmanager
+def without(logger: logging.Logger) -> Iterator[None]:
+    """Without what a logger tells, since the command says it in its result."""
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def message(text: str | Text) -> None:

@@ -15,7 +15,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.outputs import check_output_folder, make_folder
 from mpcoffline.core.tables import Table
 
-from .common import check_out, console, examples, message, print_json, say, say_file, say_prose, working
+from .common import check_out, console, examples, message, print_json, say, say_file, say_prose, without, working
 from .options import (
     Alpha,
     Json,
@@ -164,6 +164,7 @@ def learn(
         raise typer.BadParameter("give a PLANT.py with its logs, or with --dataset ID; a TASK has no logs.")
     reading = read_options(column, unit, where, log_time, time_format, timezone, episode, max_gap)
     with working("Loading"):
+        from mpcoffline.learner.candidates import outcome
         from mpcoffline.learner.learner import OfflineMPCLearner
 
         data, mpc = (
@@ -185,7 +186,8 @@ def learn(
             make_folder(path.parent)
     begin = time.perf_counter()
     try:
-        learner.fit(data, n_steps=steps, callbacks=_loggers(log_csv, tensorboard), checkpoint=checkpoint)
+        with without(outcome):
+            learner.fit(data, n_steps=steps, callbacks=_loggers(log_csv, tensorboard), checkpoint=checkpoint)
     except KeyboardInterrupt:
         if checkpoint is not None and checkpoint.exists():
             message(f"The same command goes on from {checkpoint}.")

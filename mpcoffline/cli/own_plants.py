@@ -44,7 +44,11 @@ Logs = Annotated[
 ]
 Columns = Annotated[
     list[str] | None,
-    typer.Option("--column", metavar="NAME=HEADER", help="A header that is not the plant's name; repeatable."),
+    typer.Option(
+        "--column",
+        metavar="NAME=HEADER",
+        help="A header that is not the plant's name, or its first word; repeatable. In a plant file: columns={...}.",
+    ),
 ]
 Units = Annotated[
     list[str] | None,
@@ -143,8 +147,8 @@ def check(
 
         plant = load_plant(file)
         table = plant.read(logs, **options)
-    with working("Comparing them"):
-        found = check_log(plant, table, seed=seed)
+    with working("Comparing them") as status:
+        found = check_log(plant, table, seed=seed, tell=lambda what: status.update(f"Comparing them: {what}"))
     if as_json:
         print_json(_document(plant, table, found))
     else:

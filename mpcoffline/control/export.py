@@ -86,7 +86,8 @@ def _header(mpc: MPC, solver: DDPSolver) -> str:
     low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
     labels = mpc.layout.labels
     names = [f", {c_comment(str(label))}" if labels.inputs else "" for label in mpc.layout.u_labels]
-    columns = [f" *   y[{i}]: {c_comment(str(label))}" for i, label in enumerate(mpc.layout.y_labels) if labels.states]
+    known = labels.states or mpc.layout.signals
+    columns = [f" *   y[{i}]: {c_comment(str(label))}" for i, label in enumerate(mpc.layout.y_labels) if known]
     bounds = [f" *   u[{a}]{names[a]}: from {low[a]:g} to {high[a]:g}" for a in range(mpc.nu)]
     replaced = {
         "NX": str(mpc.nx),

@@ -34,6 +34,9 @@ PLAN_NUMBERS = 1_000_000  # horizon times states and inputs; 64 input sequences 
 COMPILED_NODES = 100_000  # operations of model and costs
 COMPILED_PRODUCTS = 1_000_000  # of the model's derivatives with the value function's, a step of the Riccati recursion
 
+# Logs: what a column is called.
+HEADER = 200
+
 # Solvers.
 ITERATIONS = 100_000
 THREADS = 1_024

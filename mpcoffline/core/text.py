@@ -14,6 +14,7 @@ from .errors import FileFormatError, InvalidArgumentError, visible
 
 __all__ = [
     "LONGEST",
+    "as_name",
     "c_comment",
     "c_identifiers",
     "check_name",
@@ -80,6 +81,12 @@ def check_unit(
 ) -> str:
     """A unit, of the alphabet of names; or nothing. As :func:`check_name`."""
     return "" if unit == "" else check_name(what, unit, error=error)
+
+
+def as_name(text: str) -> str:
+    """A text as a name that :func:`check_name` takes: ``_`` for characters that no name has, and not too long."""
+    plain = "".join("_" if _foreign(c) else c for c in text.strip())[:LONGEST]
+    return plain.strip() or "_"
 
 
 @lru_cache(maxsize=4096)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpcoffline.core.text import figure as written
 from mpcoffline.core.types import Array
 from mpcoffline.plotting import PAGE_WIDTH, STYLES, controller_label, new_figure, paper_style
 from mpcoffline.simulation.trials import Trials
@@ -114,7 +115,7 @@ def draw_costs(axes: Axes, judgement: Judgement, trials: Trials) -> None:
         axes.errorbar(
             middle, place, xerr=[[middle - low], [high - middle]], fmt="s", color=color, markersize=5, capsize=3
         )
-        axes.annotate(f"{middle:.4g}", (middle, place), (0, 6), textcoords="offset points", ha="center", fontsize=7)
+        axes.annotate(written(middle, 4), (middle, place), (0, 6), textcoords="offset points", ha="center", fontsize=7)
     axes.set_yticks(range(len(rows)), [name if name == TODAY else _name(name) for name, _ in rows])
     axes.set_ylim(len(rows) - 0.4, -0.7)
     axes.margins(x=0.1)

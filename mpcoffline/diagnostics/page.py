@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from mpcoffline.core.tables import Table
-from mpcoffline.core.text import listed, visible
+from mpcoffline.core.text import figure, listed, visible
 
 from .background import Names, ParameterLine
 from .differences import SURE, TODAY, Difference, candidates
@@ -31,6 +31,15 @@ _EXPONENT = re.compile(r"e([+-]?)0*(\d+)")
 _MINUS = re.compile(r"(?<![\w.)\]-])-(?=\d)")  # in front of a number, not inside a word
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _GROUPS = {"model": "Model", "cost": "Stage cost", "terminal": "Terminal cost", "reference": "Reference"}
+_CANDIDATES = {
+    "MPC_1": "the controller of the given description",
+    "full": "all that was learned: model, stage cost, terminal cost",
+    "identified": "the model that the log identifies, all else as given",
+    "identified, farther": "the same, with the horizon and discount of the whole fit",
+    "identified, V": "the identified model, and the learned value function as terminal cost",
+    "fitted cost": "model and stage cost as learned, the terminal cost as given",
+    "running": "the controller of the trial",
+}
 _SHORT = {"recommend": "good", "try with care": "care", "keep MPC_1": "keep"}
 
 
@@ -89,6 +98,7 @@ def page_of(report: Report, *, title: str = "", names: Names | None = None, sect
         n_voting=int(report.trials.votes.sum()),
         costs=_costs(report),
         candidates=_candidates(report),
+        meanings=_meanings(report),
         models=_models(report),
         limits=_limits(report),
         groups=() if background is None else _parameters(background.parameters),
@@ -116,11 +126,10 @@ def _template() -> jinja2.Template:
 
 
 def number(value: float, digits: int = 4, sign: bool = False) -> str:
-    """A number for a reader: some digits, a real minus, powers of ten as such; what is not finite is unknown."""
+    """A number for a reader: some digits, a real minus, powers of ten where they are far; not finite is unknown."""
     if not np.isfinite(value):
         return _UNKNOWN if np.isnan(value) else "∞" if value > 0 else "−∞"
-    plain = f"{value:{'+' if sign else ''}.{digits}g}"
-    return _signed(plain)
+    return _signed(figure(value, digits, sign=sign))
 
 
 def _signed(plain: str) -> str:
@@ -179,6 +188,18 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
         }
         for each in candidates(report.choice or report.trials)
     ]
+
+
+def _meanings(report: Report) -> list[tuple[str, str]]:
+    """What the candidates are, of those whose names do not say it."""
+    names = [each.name for each in candidates(report.choice or report.trials)]
+    known = {name: text for name, text in _CANDIDATES.items() if any(each.startswith(name) for each in names)}
+    variants = {
+        ", undiscounted": ("undiscounted", "with a discount of 1, as an episode is paid"),
+        ", residual": ("residual", "with a network for what the model misses"),
+        ", polished": ("polished", "with weights that closed loops have moved"),
+    }
+    return [*known.items(), *(said for end, said in variants.items() if any(end in each for each in names))]
 
 
 def _models(report: Report) -> list[dict[str, Any]]:

@@ -35,6 +35,8 @@ TIGHTER = ", backed off"  # after the name of one whose limits were made tighter
 TRIALS = "trials/"  # in front of the names of their arrays in a file
 
 logger = logging.getLogger(__name__)
+#: Tells what was handed out. Who shows a learner's findings himself can do without.
+outcome = logger.getChild("outcome")
 
 
 def _as_it_is(mpc: MPC) -> MPC:
@@ -287,10 +289,7 @@ def tried(
     found = Candidates(mpcs, chosen, trials, tighter, effort)
     if polish:
         logger.info("%s", effort)
-    if chosen == FIRST:
-        logger.warning("%s\n%s", found.finding, found)
-    else:
-        logger.info("%s\n%s", found.finding, found)
+    outcome.log(logging.WARNING if chosen == FIRST else logging.INFO, "%s\n%s", found.finding, found)
     return found
 
 

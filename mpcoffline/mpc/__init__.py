@@ -7,6 +7,7 @@ from .constraints import CONSTRAINTS, AnyConstraint, Constraint, Penalty, StateB
 from .cost import NormCost, QuadraticCost
 from .expression_cost import ExpressionCost
 from .integration_check import IntegrationCheck
+from .labels import Label, Labels
 from .lifted import LiftedCost, polynomial_features
 from .model import Model
 from .networks import ConvexNetworkCost, NetworkCost
@@ -24,6 +25,8 @@ __all__ = [
     "ConvexNetworkCost",
     "ExpressionCost",
     "IntegrationCheck",
+    "Label",
+    "Labels",
     "LiftedCost",
     "Model",
     "NetworkCost",

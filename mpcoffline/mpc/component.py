@@ -12,9 +12,12 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.registry import Registry
+from mpcoffline.core.text import figure, listed
 from mpcoffline.core.types import Array
 
 from .parameters import Block, Parameter, ParameterSpace
+
+_MOST_TOLD = 12  # parameters
 
 
 class Component:
@@ -27,9 +30,8 @@ class Component:
     space: ParameterSpace
 
     def __repr__(self) -> str:
-        """Its class and parameters with their shapes."""
-        blocks = (f"{block.name} {block.shape}" if block.shape else block.name for block in self.space)
-        return f"{type(self).__name__}({', '.join(blocks)})"
+        """Its class and parameters: numbers with their units, of arrays the shapes."""
+        return f"{type(self).__name__}({listed([_told(block) for block in self.space], _MOST_TOLD)})"
 
     def with_theta(self, theta: Array) -> Self:
         """A copy with other parameter values, from this component's part of theta ``(size,)``."""
@@ -95,6 +97,13 @@ class TerminalCost(Protocol):
 
     def with_theta(self, theta: Array) -> Self:
         """A copy with other parameter values."""
+
+
+def _told(block: Block) -> str:
+    """A parameter in a word or two."""
+    if block.shape:
+        return f"{block.name} {block.shape}"
+    return f"{block.name} = {figure(float(block.value), 4)} {block.unit}".rstrip()
 
 
 def blocks_from_json(data: Mapping[str, Any]) -> ParameterSpace:

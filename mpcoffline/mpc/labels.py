@@ -29,8 +29,13 @@ class Label(NamedTuple):
 class Labels:
     """Names and units of the plant's states and of the inputs; none at all by default.
 
+    Example:
+        >>> labels = Labels(states=(Label("h1", "cm"), Label("h2", "cm")), inputs=(Label("pump", "V"),))
+        >>> str(labels.inputs[0])
+        'pump [V]'
+
     Args:
-        states: One a state, or none.
+        states: A name and a unit a state, or none.
         inputs: One an input, or none.
 
     Raises:

@@ -35,7 +35,7 @@ from .model import Model
 from .parameters import Group, ParameterSpace
 from .rest import at_rest, extreme_inputs
 from .seen import stage_expression, terminal_expression
-from .shown import html_of_mpc
+from .shown import html_of_mpc, text_of_mpc
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +113,8 @@ class MPC:
             raise InvalidArgumentError(name, expected=f"{self.nu} numbers, one an input", actual=str(bounds))
         return bounds
 
-    def _repr_html_(self) -> str:
-        return html_of_mpc(self)
+    __repr__ = text_of_mpc
+    _repr_html_ = html_of_mpc
 
     @property
     def nx(self) -> int:

@@ -1,4 +1,4 @@
-"""What notebooks show of an MPC."""
+"""What people see of an MPC: a line, or what notebooks show."""
 
 from __future__ import annotations
 
@@ -9,21 +9,42 @@ import numpy as np
 
 from mpcoffline.core.notebook import html_of
 from mpcoffline.core.tables import Table
+from mpcoffline.core.text import listed
 
 if TYPE_CHECKING:
     from .problem import MPC
 
+_MOST_COLUMNS = 12  # in a line
+
+
+def text_of_mpc(mpc: MPC) -> str:
+    """A line: what it sees and sets, how far it looks, parameters with their values and units."""
+    sees = listed([*map(str, mpc.layout.y_labels)], _MOST_COLUMNS)
+    parts = [f"{sees} -> {listed(_inputs(mpc), _MOST_COLUMNS)}"]
+    parts.append(f"horizon {mpc.horizon} of {mpc.model.dt:g} s, discount {mpc.discount:g}")
+    parts += [repr(mpc.model), f"stage cost {mpc.stage_cost!r}", f"terminal cost {mpc.terminal_cost!r}"]
+    parts += [f"limits {', '.join(limits)}"] if (limits := _limits(mpc)) else []
+    return f"MPC({'; '.join(parts)})"
+
+
+def _inputs(mpc: MPC) -> list[str]:
+    """Names, units and bounds of the inputs."""
+    low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
+    return [f"{u}, {a:g} to {b:g}" for u, a, b in zip(mpc.layout.u_labels, low, high, strict=True)]
+
+
+def _limits(mpc: MPC) -> list[str]:
+    """Names of the limits that have some."""
+    every = mpc.constraints if isinstance(mpc.constraints, Sequence) else []
+    return [name for each in every if (name := str(getattr(each, "name", "")))]
+
 
 def html_of_mpc(mpc: MPC) -> str:
     """States, inputs, and parameters with their units."""
-    low, high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
-    inputs = [f"{u}, {a:g} to {b:g}" for u, a, b in zip(mpc.layout.u_labels, low, high, strict=True)]
-    limits = (
-        [str(getattr(each, "name", "")) for each in mpc.constraints] if isinstance(mpc.constraints, Sequence) else []
-    )
+    limits = _limits(mpc)
     facts = [
         ("observation", ", ".join(map(str, mpc.layout.y_labels))),
-        ("inputs", "; ".join(inputs)),
+        ("inputs", "; ".join(_inputs(mpc))),
         ("sampling time", f"{mpc.model.dt:g}"),
         ("horizon", f"{mpc.horizon} steps, discount {mpc.discount:g}"),
         ("stage cost", type(mpc.stage_cost).__name__),

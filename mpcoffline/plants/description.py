@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.limits import HEADER
 from mpcoffline.core.text import check_name
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Parameter, Signal
@@ -71,6 +72,8 @@ class Plant:
             default.
         changes: With weights, what squares of changes of inputs from step to step cost; nothing by default.
         limits: What the controller has to keep besides the bounds and rates of inputs; nothing by default.
+        columns: What logs call states, inputs and signals where that is not their name: headers, or their first words
+            as ``{"h1": "LI-101"}``.
         discrete: Whether ``dynamics`` gives the next state.
         integrator: How it is integrated otherwise, see :class:`~mpcoffline.Model`.
         horizon: Steps that its MPC looks ahead.
@@ -92,6 +95,7 @@ class Plant:
     references: Mapping[str, float | str] = field(kw_only=True, default_factory=dict)
     changes: Mapping[str, float] = field(kw_only=True, default_factory=dict)
     limits: Sequence[Limit] = field(kw_only=True, default=())
+    columns: Mapping[str, str] = field(kw_only=True, default_factory=dict)
     discrete: bool = field(kw_only=True, default=False)
     integrator: str = field(kw_only=True, default="auto")
     horizon: int = field(kw_only=True, default=30)
@@ -114,6 +118,7 @@ class Plant:
         names = [each.name for each in quantities] + list(self.parameters)
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise InvalidArgumentError("names", expected="different ones", actual=f"{twice[0]!r} twice")
+        self._check_columns()
         self._check_cost()
         for limit in self.limits:
             if isinstance(limit.of, str) and limit.of not in (known := self.names("states") + self.names("inputs")):
@@ -124,6 +129,15 @@ class Plant:
     def names(self, kind: str) -> list[str]:
         """The names of its ``"states"``, ``"inputs"`` or ``"signals"``."""
         return [each.name for each in getattr(self, kind)]
+
+    def _check_columns(self) -> None:
+        known = [name for kind in ("states", "inputs", "signals") for name in self.names(kind)]
+        for name, header in dict(self.columns).items():
+            if name not in known:
+                raise _unknown("columns", name, known)
+            if not isinstance(header, str) or not 0 < len(header.strip()) <= HEADER:
+                expected = f"a header of up to {HEADER} characters"
+                raise InvalidArgumentError(f"columns: {name}", expected=expected, actual=repr(header)[:100])
 
     def _check_cost(self) -> None:
         if not isinstance(self.cost, Mapping):
@@ -274,7 +288,7 @@ class Plant:
 
         Args:
             log: A file (CSV and other text, Parquet, Arrow), a frame (polars, pandas, pyarrow), or a list of them.
-            columns: Headers by the plant's names, where they are others.
+            columns: Headers, or their first words, by the plant's names; those of the description by default.
             units: Units of the log by the plant's names, where headers do not say them.
             time: Header of the time, or of date and time; looked for by default, and without one rows are taken to be
                 ``dt`` apart.
@@ -303,7 +317,8 @@ class Plant:
         from mpcoffline.datasets.logs.wanted import Wanted
 
         states, inputs, signals = (
-            [Quantity(q.name, q.unit, q.low, q.high) for q in each] for each in (self.states, self.inputs, self.signals)
+            [Quantity(q.name, q.unit, q.low, q.high, self.columns.get(q.name, "")) for q in each]
+            for each in (self.states, self.inputs, self.signals)
         )
         previews, periods = [s.preview for s in self.signals], [s.period for s in self.signals]
         return Wanted(self.dt, states, inputs, signals, previews, periods, self.costs)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpcoffline.core.tables import Table
-from mpcoffline.core.text import listed
+from mpcoffline.core.text import figure, listed
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.plant import plant_rows
@@ -107,8 +107,8 @@ def _long(seconds: float) -> str:
     """A time in words: ``"0.25 s"``, ``"12 minutes"``, ``"3.4 hours"``."""
     for size, word in ((86_400.0, "days"), (3_600.0, "hours"), (60.0, "minutes")):
         if seconds >= 2.0 * size:
-            return f"{seconds / size:.3g} {word}"
-    return f"{seconds:.3g} s"
+            return f"{figure(seconds / size, 2)} {word}"
+    return f"{figure(seconds, 2)} s"
 
 
 def time_constants(mpc: MPC, x: Array, u: Array) -> Array:

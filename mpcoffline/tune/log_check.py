@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -42,13 +42,16 @@ _RESOLVED, _COARSE_STEP = 5_000, 0.1  # rows looked at, and of a state's spread
 _TREND, _SURE = 0.05, 5.0  # of the errors' variance, and standard errors
 
 
-def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogCheck:
+def check_log(
+    plant: Plant, table: TransitionTable, *, seed: int = 0, tell: Callable[[str], None] = lambda _: None
+) -> LogCheck:
     """Compares a plant's description with a log of it, before anything is fitted.
 
     Args:
         plant: The description.
         table: The log, as :meth:`mpcoffline.Plant.read` gives it.
         seed: Seeds the choice of rows.
+        tell: Is told, in a word, what is looked at now: on a busy machine it takes minutes.
 
     Returns:
         The page; ``print`` shows it.
@@ -59,6 +62,7 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
     for each in report.left_out if report is not None else ():
         if each.why.startswith(_STUCK):
             found.add("problem", each.what, f"{each.why}, {each.count} rows from {each.first} on: is its sensor well?")
+    tell("units, signs, sampling")
     findings = check(mpc, table)
     for finding in findings.findings:
         found.add("problem", "description and data", str(finding), forbids=finding in findings.errors)
@@ -74,7 +78,9 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
         return found
     with _quiet():
         try:
+            tell("dead time")
             mpc = _dead_time(plant, mpc, table, found, seed)
+            tell("parameters")
             found.identification = identify(mpc, table, seed=seed)
         except InvalidDataError as error:
             found.add("problem", "identification", str(error), forbids=True)
@@ -82,6 +88,7 @@ def check_log(plant: Plant, table: TransitionTable, *, seed: int = 0) -> LogChec
     parameters(plant, mpc, table, found)
     _noise(plant, found)
     _sampling(plant, mpc, table, found)
+    tell("predictions")
     _predictions(plant, mpc, table, found, seed)
     _trend(plant, mpc, table, found)
     found.sort()
@@ -161,7 +168,8 @@ def _noise(plant: Plant, found: LogCheck) -> None:
     if identified is None:
         return
     noise = identified.noise
-    parts = [f"{q.name} {v:.2g} {q.unit}".rstrip() for q, v in zip(plant.states, noise.measurement, strict=True)]
+    sizes = [(q, f"{v:.2g} {q.unit}" if v > 0.0 else "") for q, v in zip(plant.states, noise.measurement, strict=True)]
+    parts = [f"{q.name} {size or 'none that shows'}".rstrip() for q, size in sizes]
     found.add("good", "noise", f"of the measurements, standard deviation: {', '.join(parts)}")
     if noise.increments is None:
         return

@@ -80,7 +80,7 @@ def tune(
 
     def checked() -> dict[str, Any]:
         tell("Checking log and description")
-        found = check_log(plant, table, seed=options["seed"])
+        found = check_log(plant, table, seed=options["seed"], tell=lambda what: tell(f"  {what}"))
         forbidding = [each for each in found.remarks if each.forbids]
         if forbidding:
             raise InvalidDataError(

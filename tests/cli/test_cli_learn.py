@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import signal
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ import mpcoffline
 from mpcoffline import MPCPolicy, OfflineMPCLearner, nominal_mpc
 from mpcoffline.cli.main import app
 from mpcoffline.cli.options import Preset
+from mpcoffline.learner.candidates import outcome
 from mpcoffline.learner.presets import PRESETS
 from mpcoffline.learning import Bellman
 
@@ -61,6 +63,25 @@ def test_options_reach_the_fit_and_json_describes_it() -> None:
     assert [entry["epoch"] for entry in document["history"]] == [epoch for epoch, _ in learner.history]
     rows = csv.DictReader(Path("fit.csv").read_text().splitlines())
     assert {row["metric"] for row in rows} == {"value_loss", "fit_loss"}
+
+
+@pytest.mark.usefixtures("shipped")
+def test_what_is_handed_out_is_told_by_the_result_alone(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fit = OfflineMPCLearner.fit
+
+    def telling(self: OfflineMPCLearner, *args: object, **kwargs: object) -> object:
+        outcome.warning("Handed out: MPC_1.")
+        logging.getLogger("mpcoffline.learner").warning("Something else.")
+        return fit(self, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(OfflineMPCLearner, "fit", telling)
+    result = call("learn", "--dataset", DATA, "--steps", "30", "--candidate", "full")
+    assert result.exit_code == 0, result.output
+    assert "Handed out" not in caplog.text
+    assert "Something else." in caplog.text
+    assert outcome.level == logging.NOTSET
 
 
 @pytest.mark.slow

@@ -240,6 +240,7 @@ def test_the_header_documents_names_and_units(tmp_path: Path) -> None:
     assert re.search(r"double stage_cost_W\[6\]; /\* .*C C'", header)
     assert "every 0.05 s" in header
     assert "u[0]: from -2 to 2" in header
+    assert "y[0]" not in header.split("*/")[0]  # nobody gave names
     export_c(MPCPolicy(mpc_of("network")), tmp_path / "network")
     header = (tmp_path / "network" / "mpc_controller.h").read_text()
     assert re.search(r"double terminal_cost_weights_1\[36\]; /\* .*shape \(6, 6\), row by row \*/", header)

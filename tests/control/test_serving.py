@@ -89,6 +89,33 @@ def test_a_sound_loop_does_what_the_policy_does_in_the_environment(kind: str) ->
     assert clock.now() == pytest.approx(60 * DT)
 
 
+@pytest.mark.parametrize("kind", ["plain", "late"])
+def test_inputs_that_were_taken_but_not_confirmed_count_as_the_device_says(kind: str, tmp_path: Path) -> None:
+    clock, device, policy = lab(kind)
+
+    class Deaf(Broken):
+        """It takes every input; of some it says nothing."""
+
+        def write(self, inputs: Mapping[str, float]) -> None:
+            super().write(inputs)
+            if self.n in (20, 21, 35):
+                refuse()
+
+    watched, sound = Deaf(device), lab(kind)
+    same = Broken(sound[1])
+    Service(policy, same, clock=sound[0], transfer=1).run(60)
+    with DecisionLog(tmp_path / "trial.csv", policy.mpc) as decisions:
+        stats = Service(policy, watched, clock=clock, transfer=1, log=decisions).run(60)
+    assert (stats.unwritten, stats.decided) == (3, 60)
+    assert watched.written == pytest.approx(same.written, rel=1e-9)  # as if all had been confirmed
+    with (tmp_path / "trial.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    empty = [k for k, row in enumerate(rows) if row["power [%]"] == ""]
+    assert empty == [20, 21, 35]
+    known = [float(row["power [%]"]) for k, row in enumerate(rows) if k not in empty]
+    assert known == pytest.approx([u for k, u in enumerate(watched.written) if k not in empty])
+
+
 def test_it_takes_over_from_what_is_in_effect() -> None:
     clock, device, policy = lab("late", power=60.0)
     watched = Broken(device)

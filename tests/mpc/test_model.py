@@ -139,7 +139,7 @@ def test_a_name_that_is_no_parameter() -> None:
 
 
 def test_it_names_its_parameters() -> None:
-    assert repr(Model(lambda x, u, p: p["A"] @ x, 2, 1, 0.1, {"A": np.eye(2), "m": 1.0})) == "Model(A (2, 2), m)"
+    assert repr(Model(lambda x, u, p: p["A"] @ x, 2, 1, 0.1, {"A": np.eye(2), "m": 1.0})) == "Model(A (2, 2), m = 1)"
 
 
 def test_json_roundtrip_bit_for_bit() -> None:

@@ -15,6 +15,7 @@ from mpcoffline.cli import app
 from mpcoffline.cli.own_plants import _show
 from mpcoffline.core.tables import Table
 from mpcoffline.tune import LogCheck, check_log
+from mpcoffline.tune.determined import _long
 from mpcoffline.tune.experiment import experiments
 from mpcoffline.tune.log_check import _gain
 
@@ -46,8 +47,9 @@ def test_a_planted_defect_is_named(case: Case) -> None:
 
 
 def test_a_sound_log_is_worth_tuning_and_the_page_says_what_it_determines() -> None:
-    plant = heater()
-    page = check_log(plant, plant.read(LOG))
+    plant, told = heater(), list[str]()
+    page = check_log(plant, plant.read(LOG), tell=told.append)
+    assert told == ["units, signs, sampling", "dead time", "parameters", "predictions"]
     assert page.problems == []
     assert page.verdict.startswith("Worth tuning.")
     assert page.identification is not None
@@ -63,6 +65,14 @@ def test_a_sound_log_is_worth_tuning_and_the_page_says_what_it_determines() -> N
     (parameters,) = [table for table in page.tables if table.title == "Parameters"]
     assert [row[-1] for row in parameters.rows] == ["yes", "yes"]
     assert page.identification.noise.measurement[0] == pytest.approx(0.05, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.25, "0.25 s"), (113.0, "110 s"), (200.0, "3.3 minutes"), (7_200.0, "2 hours"), (259_200.0, "3 days")],
+)
+def test_times_have_as_many_digits_as_they_deserve(seconds: float, words: str) -> None:
+    assert _long(seconds) == words
 
 
 def test_the_verdict_claims_no_more_than_is_known() -> None:

@@ -85,7 +85,9 @@ class Service:
     * *Bumpless*: over the first ``transfer`` decisions, and again after a fall-back, the policy's input is blended into
       the one in effect: ``u = u_before + k / transfer (u_policy - u_before)``. What the device says is in effect at the
       first measurement counts as past input, so that limits on changes hold from the first step on.
-    * Past inputs that the MPC's state holds are those that were applied, not those that were wanted.
+    * Past inputs that the MPC's state holds are those that were applied, not those that were wanted. Whether inputs act
+      that the device has not confirmed nobody knows: the log leaves them empty, and what the device says is in effect
+      at the next measurement counts.
 
     Example:
         >>> service = Service(policy, LineDevice("127.0.0.1", 5020), fallback={"power": 0.0}, log=log)
@@ -140,7 +142,7 @@ class Service:
         self.stats = ServiceStats()
         self._plan, self._memory = Plan.none(1, mpc), layout.filled(mpc.usual_input)
         self._applied = np.array(mpc.usual_input, dtype=np.float64)
-        self._taken_over = self._wrong = False
+        self._taken_over = self._wrong = self._unsure = False
         self._without = self._blended = 0
 
     def _given(self, fallback: Mapping[str, float]) -> Array:
@@ -189,9 +191,10 @@ class Service:
         note = decision.note
         if (refused := self._write(decision.inputs, begin + self.period)) is not None:
             self.stats.unwritten += 1
+            self._unsure |= not np.array_equal(decision.inputs, self._applied)
             note = "; ".join(filter(None, [note, refused]))
         else:
-            self._applied = decision.inputs
+            self._applied, self._unsure = decision.inputs, False
         if self._layout.n_memory:
             self._memory = self._layout.remembered(self._memory, self._applied)
         late = self._clock.now() - begin
@@ -201,7 +204,8 @@ class Service:
             self._wrong = bool(note)
             self._tell(note if note else "Well again.")
         if self._log is not None:
-            self._log.row(epoch, values, self._applied, decision.wanted, decision.by, late, solving, note)
+            acting = np.full(len(self._names), np.nan) if self._unsure else self._applied
+            self._log.row(epoch, values, acting, decision.wanted, decision.by, late, solving, note)
 
     def _decided(self, begin: float, epoch: float) -> tuple[Mapping[str, float], _Decision, float]:
         """What was measured, what is to be applied, and how long the policy took."""
@@ -214,6 +218,8 @@ class Service:
             return {}, self._instead(f"no measurement: {_short(error)}"), 0.0
         if not self._taken_over:
             self._take_over(measured)
+        elif self._unsure:
+            self._corrected(measured)
         solves = self._policy.solver_stats
         at_hand, without, started = solves.n_best_plan + solves.n_previous_plan, solves.n_zero, self._clock.now()
         y = np.array([values[name] for name in self._columns])
@@ -263,11 +269,20 @@ class Service:
     def _take_over(self, measured: Measurement) -> None:
         """The inputs in effect when the first measurement comes, as far as the device knows them."""
         self._taken_over = True
-        for i, name in enumerate(self._names):
-            value = float(measured.inputs.get(name, math.nan))
-            if math.isfinite(value):
-                self._applied[i] = min(max(value, float(self._low[i])), float(self._high[i]))
+        self._applied = self._in_effect(measured)
         self._memory = self._layout.filled(self._applied)
+
+    def _corrected(self, measured: Measurement) -> None:
+        """The same after inputs that the device has not confirmed: perhaps it did take them."""
+        self._applied = self._in_effect(measured)
+        inputs, ages = self._layout.ages
+        newest = ages == 1
+        self._memory[newest] = self._applied[inputs[newest]]
+
+    def _in_effect(self, measured: Measurement) -> Array:
+        """The inputs that the device says are in effect, within their bounds; those that it does not say as before."""
+        said = np.array([float(measured.inputs.get(name, math.nan)) for name in self._names])
+        return np.where(np.isfinite(said), np.clip(said, self._low, self._high), self._applied)
 
     def _complete(self, measured: Measurement, epoch: float) -> dict[str, float]:
         """The columns of the observation by name.

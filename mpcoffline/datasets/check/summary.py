@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from mpcoffline.core.text import markdown
 from mpcoffline.datasets.hub.loading import load_dataset
 from mpcoffline.datasets.recipes import catalog_file
 from mpcoffline.datasets.store.local import shipped_datasets
+from mpcoffline.datasets.store.names import names_of
 from mpcoffline.datasets.table.numbers import check_numbers
 from mpcoffline.envs import find_plant
 
@@ -106,9 +108,8 @@ def show(dataset: MinariDataset | str, figure: str | Path | None = None) -> Summ
         picture = io.BytesIO()
         coverage(dataset, columns).savefig(picture, format=path.suffix.lstrip(".").lower() or "png", dpi=130)
         write_file(path, picture.getvalue())
-    named = [
-        (f"{key}[{i}]", columns[key][:, i]) for key in ("observation", "action") for i in range(columns[key].shape[1])
-    ]
+    values = [*columns["observation"].T, *columns["action"].T]
+    named = list(zip(column_names(dataset), values, strict=True))
     named += [("cost L of a step", columns["cost"]), ("cost J of an episode", columns["J"])]
     named.append(("steps of an episode", columns["length"]))
     return Summary(
@@ -134,10 +135,21 @@ def coverage(dataset: MinariDataset, columns: dict[str, NDArray[np.float64]] | N
     plant = find_plant(dataset.env_spec.id) if dataset.env_spec is not None else None
     if plant is not None and "state" in data:
         return coverage_figure(panels_of(plant), data["state"], data["action"])
-    size = data["observation"].shape[1]
-    axes = [Axis(f"observation [{i}]", "state", i) for i in range(size)]
+    size, names = data["observation"].shape[1], column_names(dataset)
+    axes = [Axis(names[i], "state", i) for i in range(size)]
     pairs = [(axes[i], axes[i + 1]) for i in range(0, min(size, 6) - 1, 2)]
-    return coverage_figure([*pairs, (axes[0], Axis("action [0]", "action", 0))], data["observation"], data["action"])
+    return coverage_figure([*pairs, (axes[0], Axis(names[size], "action", 0))], data["observation"], data["action"])
+
+
+def column_names(dataset: MinariDataset) -> tuple[str, ...]:
+    """What the columns of a data set are called, observations first: by name and unit, else ``observation[0]`` ...
+
+    Raises:
+        FileFormatError: For stored names that are none.
+    """
+    spaces = {"observation": dataset.observation_space, "action": dataset.action_space}
+    sizes = {kind: math.prod(space.shape or ()) for kind, space in spaces.items()}
+    return names_of(dataset) or tuple(f"{kind}[{i}]" for kind, size in sizes.items() for i in range(size))
 
 
 def _columns(dataset: MinariDataset) -> dict[str, NDArray[np.float64]]:
@@ -171,6 +183,7 @@ def _columns(dataset: MinariDataset) -> dict[str, NDArray[np.float64]]:
 
 def _facts(dataset: MinariDataset, columns: dict[str, NDArray[np.float64]]) -> dict[str, str]:
     metadata, spec = dataset.storage.metadata, dataset.env_spec
+    names, size = names_of(dataset), columns["observation"].shape[1]
     arguments = ", ".join(f"{key} = {value}" for key, value in spec.kwargs.items()) if spec is not None else ""
     terminated = int(columns["ends"].sum())
     high = np.abs(columns["action"]).max(axis=0)
@@ -179,6 +192,8 @@ def _facts(dataset: MinariDataset, columns: dict[str, NDArray[np.float64]]) -> d
         "environment": f"{spec.id}{f' ({arguments})' if arguments else ''}" if spec is not None else "",
         "algorithm": str(metadata.get("algorithm_name") or ""),
         "description": str(metadata.get("description") or ""),
+        "observation": ", ".join(names[:size]),
+        "action": ", ".join(names[size:]),
         "episodes": f"{len(columns['J'])} ({terminated} terminated, {len(columns['J']) - terminated} truncated)",
         "steps": str(len(columns["cost"])),
         "actions at their extremes": f"{at_bound:.0%}",

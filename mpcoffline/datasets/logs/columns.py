@@ -24,6 +24,7 @@ _MISSING = (
 )  # fmt: skip
 _SWITCHES = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0, "ein": 1.0, "aus": 0.0}
 _SHOWN = 40  # characters of a header in a message
+_ALIKE = 0.5  # of two names, from which one may be meant by the other
 _MOST_TEXT = 0.2  # share of a column's cells that may be text
 
 
@@ -35,12 +36,14 @@ class Quantity(NamedTuple):
         unit: The unit that it is wanted in; empty where any will do.
         low: The least that it may be.
         high: The largest.
+        header: What logs usually call its column, where that is not its name; a column of its name is it, too.
     """
 
     name: str
     unit: str = ""
     low: float = -np.inf
     high: float = np.inf
+    header: str = ""
 
 
 class Found(NamedTuple):
@@ -69,13 +72,30 @@ def _plain(text: str) -> str:
     return re.sub(r"[\W_]+", "", text.casefold())
 
 
+def _begins(header: str, given: str) -> bool:
+    """Whether the first words of a header, such as its tag, are these."""
+    whole, begin = header.strip().casefold(), given.strip().casefold()
+    return bool(begin) and whole.startswith(begin) and not whole[len(begin) : len(begin) + 1].isalnum()
+
+
+def _nearest(wanted: str, headers: Sequence[str]) -> str:
+    """The header that may be meant by a text, as a whole, without its unit or by its tag; empty where none is near."""
+
+    def alike(header: str) -> float:
+        forms = {header, readings(header)[0].name, *header.split()[:1]}
+        return max(difflib.SequenceMatcher(None, wanted, form).ratio() for form in forms)
+
+    best = max(headers, key=alike, default="")
+    return best if best and alike(best) >= _ALIKE else ""
+
+
 def place_of(source: Source, name: str, given: str | None) -> tuple[int, str | None]:
     """The column of a name, and the unit that its header says.
 
     Args:
         source: The log.
         name: What is looked for.
-        given: The header that the user says it has; None to look for the name.
+        given: The header that the user says it has, or how it begins (its tag); None to look for the name.
 
     Raises:
         InvalidDataError: If there is none, or more than one.
@@ -86,7 +106,9 @@ def place_of(source: Source, name: str, given: str | None) -> tuple[int, str | N
         for reading in readings(header):
             exact = 0 if header.strip() == wanted else 1 if reading.name == wanted else 2
             if exact == 2 and _plain(reading.name) != _plain(wanted):
-                continue
+                if given is None or not _begins(header, given):
+                    continue
+                exact = 3
             if i not in ranks or exact < ranks[i][0]:
                 ranks[i] = exact, readings(header)[0].unit if reading.unit is None else reading.unit
     best = min((rank for rank, _ in ranks.values()), default=0)
@@ -102,8 +124,8 @@ def place_of(source: Source, name: str, given: str | None) -> tuple[int, str | N
         actual = ", ".join(repr(source.header[i]) for i in chosen)
         hint = f"columns={{{name!r}: ...}} says which (--column {name}=...)."
         raise InvalidDataError(where, expected="one column of that name", actual=f"{len(chosen)}: {actual}", hint=hint)
-    near = difflib.get_close_matches(wanted, source.header, n=1, cutoff=0.4)
-    hint = f"Is it {near[0][:_SHOWN]!r}? " if near else ""
+    near = _nearest(wanted, source.header)
+    hint = f"Is it {near[:_SHOWN]!r}? " if near else ""
     raise MissingColumnError(
         where,
         expected=f"one among {listed}",
@@ -126,7 +148,7 @@ def found(
         if other := [name for name in given if name not in known]:
             raise InvalidArgumentError(argument, expected=f"names among {', '.join(known)}", actual=repr(other[0]))
     result: dict[str, Found] = {}
-    places = _places(source, known, columns)
+    places = _places(source, quantities, columns)
     for each in quantities:
         place, unit = places[each.name]
         unit, header = units.get(each.name, unit), source.header[place]
@@ -141,18 +163,33 @@ def found(
     return result
 
 
-def _places(source: Source, names: Sequence[str], columns: Mapping[str, str]) -> dict[str, tuple[int, str | None]]:
+def _placed(source: Source, each: Quantity, given: str | None) -> tuple[int, str | None]:
+    """The column of a quantity: as the user says, as its description says, or by its name."""
+    if given is not None or not each.header:
+        return place_of(source, each.name, given)
+    try:
+        return place_of(source, each.name, each.header)
+    except MissingColumnError as error:
+        try:
+            return place_of(source, each.name, None)
+        except MissingColumnError:
+            raise error from None
+
+
+def _places(
+    source: Source, quantities: Sequence[Quantity], columns: Mapping[str, str]
+) -> dict[str, tuple[int, str | None]]:
     """The column of each name and its unit; all names that have none are told at once.
 
     Raises:
         InvalidDataError: If some have none, or more than one.
     """
-    result, missing = {}, {}
-    for name in names:
+    result, missing, said_so = {}, {}, {each.name: each.header or each.name for each in quantities} | dict(columns)
+    for each in quantities:
         try:
-            result[name] = place_of(source, name, columns.get(name))
+            result[each.name] = _placed(source, each, columns.get(each.name))
         except MissingColumnError as error:
-            missing[name] = error
+            missing[each.name] = error
     if not missing:
         return result
     first = next(iter(missing.values()))
@@ -161,7 +198,7 @@ def _places(source: Source, names: Sequence[str], columns: Mapping[str, str]) ->
     guesses = [f"{name}: {error.hint.partition('?')[0]}?" for name, error in missing.items() if "?" in error.hint]
     said = f"{' '.join(guesses)} " if guesses else ""
     raise MissingColumnError(
-        f"{source.name}: columns of {', '.join(map(repr, missing))}",
+        f"{source.name}: columns of {', '.join(repr(said_so[name]) for name in missing)}",
         expected=first.expected,
         actual="none of them",
         hint=f"{said}columns={{{next(iter(missing))!r}: ..., ...}} says which (--column {next(iter(missing))}=...).",

@@ -29,6 +29,7 @@ _SLOW = 1.2  # control intervals, beyond which rows are too far apart
 _HARMLESS = 0.05  # of what a step moves, by which a bridged value may be off
 _OVER_ONE = 2.05  # times the usual time between rows, over one that is missing
 _CLIPPED = 0.01  # of an input's range, by which it may lie beyond its bounds
+_ROUNDED = 1e-3  # of a signal's range
 _MOST_BEYOND = 0.2  # share of rows
 _UNIT = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
 
@@ -39,7 +40,6 @@ class LoggedTable(TransitionTable):
     Attributes:
         report: What became of the log.
         action_bounds: Bounds of the inputs, ``(nu,)`` each.
-        names: Names and units of its columns, observations first.
         options: As what it was read.
         header: Names of the first log's columns.
     """
@@ -48,11 +48,6 @@ class LoggedTable(TransitionTable):
     options: Options
     header: list[str]
     action_bounds: tuple[Array, Array]
-    names: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        """Its log and columns."""
-        return f"LoggedTable({self.name!r}, n={len(self)}; {', '.join(self.names)})"
 
     def to_minari(self, dataset_id: str, *, overwrite: bool = False) -> MinariDataset:
         """Stores the log as a Minari data set.
@@ -76,11 +71,8 @@ class LoggedTable(TransitionTable):
             for p in parts
         ]
         low, high = self.action_bounds
-        s, a = (", ".join(names) for names in (self.names[: self.ny], self.names[self.ny :]))
-        text = f"Log {self.name}. Observations: {s}. Actions: {a}."
-        return dataset_from_arrays(
-            dataset_id, episodes, action_low=low, action_high=high, description=text, overwrite=overwrite
-        )
+        how: dict[str, Any] = {"description": f"Log {self.name}.", "names": self.names, "overwrite": overwrite}
+        return dataset_from_arrays(dataset_id, episodes, action_low=low, action_high=high, **how)
 
 
 def read_log(sources: Any, wanted: Wanted, options: Options) -> LoggedTable:
@@ -171,7 +163,8 @@ def _plausible(rows: Rows, each: Quantity, report: LogReport) -> None:
         return
     if np.mean((v < each.low - width) | (v > each.high + width)) > _MOST_BEYOND:
         _refuse_beyond(rows, each, (v < each.low) | (v > each.high), _UNIT)
-    share = float(np.mean((v < each.low) | (v > each.high)))
+    margin = _ROUNDED * width  # an end that was converted, or written with few digits
+    share = float(np.mean((v < each.low - margin) | (v > each.high + margin)))
     if share > _CLIPPED:
         text = f"{each.name} is outside its range, {each.low:g} to {each.high:g} {each.unit}".rstrip()
         report.note(f"{text}, in {share:.0%} of the rows")

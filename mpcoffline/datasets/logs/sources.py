@@ -25,7 +25,7 @@ BATCH = 250_000  # rows
 _HEAD = 64 * 1024  # bytes that are looked at
 _LINES = 50
 _FEWEST_LINES, _LONGEST_HEAD = 5, 1 << 24  # that are looked at, of tables with thousands of columns
-_SEPARATORS = ",;\t|"
+_SEPARATORS, _FEW_NUMBERS = ",;\t|", 0.2  # share of cells below the header
 _BINARY = {
     b"\xfd7zXZ": ("an xz archive", "Unpack it first."),
     b"BZh": ("a bzip2 archive", "Unpack it first."),
@@ -282,7 +282,7 @@ def _open_quote(path: Path, first: int) -> int:
 
 def _layout(name: str, lines: list[str]) -> tuple[str, int]:
     """What separates columns, and how many lines come before the header."""
-    best: tuple[bool, int, int, str, int] | None = None
+    best: tuple[bool, bool, int, int, str, int] | None = None
     for separator in _SEPARATORS:
         rows = list(csv.reader(lines, delimiter=separator))
         counts = [len(row) for row in rows]
@@ -292,13 +292,16 @@ def _layout(name: str, lines: list[str]) -> tuple[str, int]:
         start = next((i for i, n in enumerate(counts) if n == usual), 0)
         # Decimal commas split numbers alike in every row, but not the names above them.
         named = not any(re.fullmatch(_NUMBER, cell.strip()) for cell in rows[start])
-        found = named, times, usual, separator, start
-        if best is None or found[:2] > best[:2] or (named >= best[0] and usual > best[2] + 1):
+        below = [cell.strip() for row in rows[-20:] for cell in row]
+        # ... and where text stands at both ends of a row, no number is left whole.
+        whole = sum(bool(re.fullmatch(_NUMBER, cell)) for cell in below) > _FEW_NUMBERS * len(below)
+        found = named, whole, times, usual, separator, start
+        if best is None or found[:3] > best[:3] or (found[:2] >= best[:2] and usual > best[3] + 1):
             best = found
     if best is None:
         hint = "Columns are separated by a comma, a semicolon, a tab or a bar."
         raise InvalidDataError(name, expected="a table of several columns", actual="one column", hint=hint)
-    return best[3], best[4]
+    return best[4], best[5]
 
 
 def _is_value(cell: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError
+from mpcoffline.core.limits import HEADER, check_limit
 from mpcoffline.core.text import check_name, check_unit
 from mpcoffline.core.types import Array
 from mpcoffline.mpc.expressions import function_from_json, function_to_json
@@ -93,10 +94,14 @@ class Wanted:
 
 def _quantity_to_json(each: Quantity) -> dict[str, Any]:
     ends = {end: float(getattr(each, end)) for end in ("low", "high") if np.isfinite(getattr(each, end))}
-    return {"name": each.name, "unit": each.unit} | ends
+    return {"name": each.name, "unit": each.unit} | ends | ({"header": each.header} if each.header else {})
 
 
 def _quantity_from_json(data: Mapping[str, Any]) -> Quantity:
     name = check_name("name of a quantity", data["name"], error=FileFormatError)
     unit = check_unit(f"unit of {name}", data["unit"], error=FileFormatError)
-    return Quantity(name, unit, float(data.get("low", -np.inf)), float(data.get("high", np.inf)))
+    header = data.get("header", "")
+    if not isinstance(header, str):
+        raise FileFormatError(f"header of {name}", expected="a text", actual=repr(header)[:100])
+    check_limit(f"header of {name}", "characters", len(header), HEADER)
+    return Quantity(name, unit, float(data.get("low", -np.inf)), float(data.get("high", np.inf)), header)

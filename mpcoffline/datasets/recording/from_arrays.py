@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
+from mpcoffline.datasets.store.names import checked_names
 from mpcoffline.datasets.store.writing import episode_of, write_dataset
 from mpcoffline.datasets.table.arrays import types_that_hold
 from mpcoffline.datasets.table.numbers import floats
@@ -26,6 +27,7 @@ def dataset_from_arrays(
     action_high: ArrayLike = np.inf,
     terminated: Sequence[bool] | None = None,
     description: str | None = None,
+    names: Sequence[str] = (),
     overwrite: bool = False,
 ) -> MinariDataset:
     """Stores trajectories as a Minari data set.
@@ -40,10 +42,11 @@ def dataset_from_arrays(
         action_high: Upper bounds of the actions.
         terminated: For each episode, whether it ended in a terminal state; otherwise it was cut off there.
         description: Stored as metadata.
+        names: What the columns are called, with units as ``"level [cm]"``, observations first; none by default.
         overwrite: Whether an existing data set of this id may be replaced.
 
     Raises:
-        InvalidArgumentError: For a bad id, or one that exists.
+        InvalidArgumentError: For a bad id, or one that exists, or names that are none or not one a column.
         InvalidDataError: For a wrong shape, NaN or inf, or an action out of bounds; names episode and step.
         StorageError: Where the disk refuses.
     """
@@ -59,6 +62,7 @@ def dataset_from_arrays(
             raise InvalidDataError(
                 f"episode {i}", expected=f"{ny} observations and {nu} actions", actual=f"{s.shape[1]}, {a.shape[1]}"
             )
+    called = checked_names(f"data set {dataset_id!r}", names, ny + nu) if names else ()
     state_type, action_type = types_that_hold(checked)
     low, high = (np.broadcast_to(np.asarray(b, action_type), (nu,)).copy() for b in (action_low, action_high))
     for i, (_, a, _) in enumerate(checked):
@@ -80,6 +84,7 @@ def dataset_from_arrays(
         observation_space=spaces.Box(-np.inf, np.inf, (ny,), state_type),
         action_space=spaces.Box(low, high, (nu,), action_type),
         description=description,
+        names=called,
         overwrite=overwrite,
     )
 

@@ -12,10 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
+from mpcoffline.core.text import as_name
 from mpcoffline.datasets.table.numbers import real_numbers
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 from .from_arrays import dataset_from_arrays
+
+_RESAMPLED = "mpcoffline.Plant.read resamples to the control interval of a described plant."
+_RAW = (
+    "mpcoffline.Plant.read takes a log as a historian writes it: empty cells, time stamps, decimal commas, other units."
+)
 
 Cost = Callable[[NDArray[np.float64], NDArray[np.float64]], ArrayLike]
 
@@ -80,7 +86,7 @@ def from_csv(
                 f"{name}, line {lines[row]}: {time}",
                 expected=f"{dt:g} s more than the row before",
                 actual=f"{gaps[row - 1]:g} s ({int(wrong.sum())} such rows)",
-                hint="Name the column that tells episodes apart, or pass split_gaps=True.",
+                hint=_hint_of_gaps(gaps[~starts[1:]], dt),
             )
         starts[1:] |= wrong
     goes_on = np.flatnonzero(~starts[1:])
@@ -102,6 +108,7 @@ def from_csv(
     table = TransitionTable.from_arrays(
         s[goes_on], a[goes_on], costs, s[goes_on + 1], np.zeros(len(goes_on)), ids[goes_on], name=name
     )
+    table.names = tuple(map(as_name, (*observations, *actions)))
     if dataset_id is not None:
         pieces = [goes_on[ids[goes_on] == i] for i in np.unique(ids[goes_on])]
         order = np.searchsorted(goes_on, np.concatenate(pieces))
@@ -111,6 +118,7 @@ def from_csv(
             dataset_id,
             [(s[k[0] : k[-1] + 2], a[k], c) for k, c in zip(pieces, parts, strict=True)],
             description=f"Log {Path(path).name}.",
+            names=table.names,
             overwrite=overwrite,
         )
     return table
@@ -161,8 +169,17 @@ def _number(name: str, line: int, column: str, cell: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InvalidDataError(f"{name}, line {line}: column {column!r}", expected="a finite number", actual=repr(cell))
+        expected, actual = "a finite number", repr(cell)
+        raise InvalidDataError(f"{name}, line {line}: column {column!r}", expected=expected, actual=actual, hint=_RAW)
     return value
+
+
+def _hint_of_gaps(gaps: NDArray[np.float64], dt: float) -> str:
+    """What to do about rows at other distances: most of them, and it is the sampling time; a few, and they are gaps."""
+    usual = float(np.median(gaps))
+    if abs(usual - dt) > 0.01 * dt:
+        return f"Rows are {usual:g} s apart: pass dt={usual:g}. {_RESAMPLED}"
+    return "Name the column that tells episodes apart, or pass split_gaps=True."
 
 
 def _starts(name: str, labels: list[str], lines: list[int], episode: str | None) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ import importlib.metadata
 import itertools
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,7 @@ from mpcoffline.core.scratch import scratch_folder
 from .hdf5_writing import store_episodes
 from .ids import check_dataset_id, dataset_path, is_local
 from .manifest import write_manifest
+from .names import NAMES
 from .opening import open_dataset, read_metadata
 from .recording_lock import check_not_recorded
 
@@ -100,6 +101,7 @@ def write_dataset(
     extend: bool = False,
     recording: str | None = None,
     building: Path | None = None,
+    names: Sequence[str] = (),
 ) -> MinariDataset:
     """Stores episodes as a Minari data set, which appears complete or not at all.
 
@@ -119,6 +121,7 @@ def write_dataset(
         extend: Whether the new data set begins with the episodes of the one replaced, and keeps its metadata.
         recording: Name of the recording that the episodes come from, kept in the metadata.
         building: The folder to build in, which must not exist; by default a hidden one in the store.
+        names: Metadata: what its columns are called, observations first; none where nobody said.
 
     Returns:
         The stored data set.
@@ -138,7 +141,7 @@ def write_dataset(
         raise InvalidArgumentError(f"data set {dataset_id!r}", expected="at least one transition", actual="none")
     target = dataset_path(dataset_id)
     new_folders = [folder for folder in target.parents if not folder.exists()]
-    metadata = {RECORDING: recording}
+    metadata: dict[str, Any] = {RECORDING: recording}
     scratch = ExitStack()
     try:
         if building is None:
@@ -159,6 +162,7 @@ def write_dataset(
                 "minari_version": importlib.metadata.version("minari"),
                 "algorithm_name": algorithm_name,
                 "description": description,
+                NAMES: list(names) or None,
             }
         store_episodes(storage, itertools.chain([first], iterator), new=not extend)
         finish(building, {key: value for key, value in metadata.items() if value is not None})
@@ -177,7 +181,7 @@ def write_dataset(
     return open_dataset(target, sums=False)
 
 
-def finish(building: Path, metadata: dict[str, str]) -> None:
+def finish(building: Path, metadata: dict[str, Any]) -> None:
     """Completes a data set's folder: data on the disk, then its metadata, then the manifest of both."""
     sync_tree(building)
     path = building / "data" / "metadata.json"

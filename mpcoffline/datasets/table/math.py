@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.core.errors import InvalidArgumentError
+
 CHUNK = 1 << 16
 _SIGN = np.uint32(1 << 31)
 
@@ -213,3 +215,24 @@ def _halves(rows: NDArray[np.float32], ny: int) -> Iterator[tuple[NDArray[Any], 
         bits = np.ascontiguousarray(rows[i : i + CHUNK, :ny]).view(np.uint32)
         bits = np.where(bits & _SIGN, ~bits, bits | _SIGN)
         yield bits >> 16, bits & 0xFFFF
+
+
+def drawn_episodes(name: str, ids: NDArray[np.int64], fraction: float, seed: int) -> NDArray[np.bool_]:
+    """Whether each row is of the episodes that are drawn, ``(n,)``: at least one of them, and not all.
+
+    Args:
+        name: What error messages call the table.
+        ids: Episode of each row, ``(n,)``.
+        fraction: Share of the episodes that are drawn, in (0, 1).
+        seed: Seed of the draw.
+
+    Raises:
+        InvalidArgumentError: For another fraction, or fewer than two episodes.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise InvalidArgumentError("fraction", expected="a number in (0, 1)", actual=str(fraction))
+    episodes = np.unique(ids)
+    if len(episodes) < 2:
+        raise InvalidArgumentError(f"{name}: episodes", expected="two or more to split", actual="1")
+    count = min(max(1, round(fraction * len(episodes))), len(episodes) - 1)
+    return np.isin(ids, np.random.default_rng(seed).permutation(episodes)[:count])

@@ -22,7 +22,7 @@ def html_of_rows(table: Any) -> str:
         for part in (s.low, s.mean, s.high, s.std)
     ]
     unnamed = [*(f"observation {i}" for i in range(table.ny)), *(f"action {j}" for j in range(table.nu))]
-    names = [*getattr(table, "names", unnamed), "cost"]
+    names = [*(table.names or unnamed), "cost"]
     rows = [(label, *(f"{v:.4g}" for v in each)) for label, each in zip(names, zip(*parts, strict=True), strict=True)]
     shown = Table(("column", "least", "mean", "most", "spread"), rows, align="lr")
     episodes = f"{table.n_episodes:,} {'episode' if table.n_episodes == 1 else 'episodes'}"

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.datasets.store.names import names_of
 
 from .arrays import read_arrays
 from .build import BuiltRows, joined, read_minari
 from .cache import TableFile, default_memory, scratch_table
 from .centring import Centring
-from .math import CHUNK, Columns, Episodes, TableStatistics, innermost, moments, split
+from .math import CHUNK, Columns, Episodes, TableStatistics, drawn_episodes, innermost, moments, split
 from .numbers import check_bounds, check_sizes
 from .sampler import block_batches, gather_batches
 from .shown import html_of_rows
@@ -49,6 +50,7 @@ class TransitionTable:
         centring: What the rows were packed without; nothing by default.
         file: Where the rows are a memory map, the file that they are in.
         memory: Bytes that sampling a mapped table may occupy; a quarter of the machine's memory by default.
+        names: Names and units of the columns, observations first, as ``"level [cm]"``; none where nobody said.
     """
 
     def __init__(
@@ -62,11 +64,12 @@ class TransitionTable:
         centring: Centring | None = None,
         file: TableFile | None = None,
         memory: int | None = None,
+        names: tuple[str, ...] = (),
     ) -> None:
         self._rows, self.ny, self.nu, self._episode_ids, self.name = rows, ny, nu, episode_ids, name
         self.centring = Centring.none(ny, nu) if centring is None else centring
         self._plain = self.centring.is_none
-        self._file, self._memory = file, memory
+        self._file, self._memory, self.names = file, memory, names
 
     @property
     def rows(self) -> NDArray[np.float32]:
@@ -87,10 +90,10 @@ class TransitionTable:
         return len(self._rows)
 
     def __repr__(self) -> str:
-        return f"TransitionTable({self.name!r}, n={len(self)}, ny={self.ny}, nu={self.nu})"
+        what = f"; {', '.join(self.names)}" if self.names else f", ny={self.ny}, nu={self.nu}"
+        return f"{type(self).__name__}({self.name!r}, n={len(self)}{what})"
 
-    def _repr_html_(self) -> str:
-        return html_of_rows(self)
+    _repr_html_ = html_of_rows
 
     @property
     def observations(self) -> NDArray[np.floating[Any]]:
@@ -142,9 +145,8 @@ class TransitionTable:
 
     def take(self, rows: NDArray[np.intp] | slice) -> TransitionTable:
         """A table in memory of some of the rows, in the order given: ``table.take(table.episodes.rows(-1))``."""
-        return TransitionTable(
-            self.rows[rows], self.ny, self.nu, self.episode_ids[rows], self.name, centring=self.centring
-        )
+        own: dict[str, Any] = {"name": self.name, "centring": self.centring, "names": self.names}
+        return TransitionTable(self.rows[rows], self.ny, self.nu, self.episode_ids[rows], **own)
 
     def sample(self, count: int, rng: np.random.Generator | int) -> TransitionTable:
         """A table in memory of rows drawn at random, each at most once, in the order that they have here.
@@ -164,8 +166,8 @@ class TransitionTable:
         values = self.centring.values(self.rows)
         columns = split(values, self.ny, self.nu)
         columns.observations[:], columns.next_observations[:] = observations, next_observations
-        rows = self.centring.packed(values)
-        return TransitionTable(rows, self.ny, self.nu, self.episode_ids, self.name, centring=self.centring)
+        own: dict[str, Any] = {"name": self.name, "centring": self.centring, "names": self.names}
+        return TransitionTable(self.centring.packed(values), self.ny, self.nu, self.episode_ids, **own)
 
     def goes_on(self) -> NDArray[np.bool_]:
         """Whether a row's s+ is the s of the next, ``(n - 1,)``; where centred, but for the last digits of float32."""
@@ -245,7 +247,9 @@ class TransitionTable:
             dataset = load_dataset(dataset)
         name = f"data set {dataset.spec.dataset_id!r}"
         memory = default_memory() if memory is None else memory
-        return cls._of(read_minari(dataset, name, memory, None if cache is None else Path(cache)), name, memory)
+        table = cls._of(read_minari(dataset, name, memory, None if cache is None else Path(cache)), name, memory)
+        table.names = names_of(dataset)
+        return table
 
     @classmethod
     def concat(cls, tables: Sequence[TransitionTable], *, name: str | None = None) -> TransitionTable:
@@ -290,9 +294,12 @@ class TransitionTable:
         centring, (ny, nu) = centring or self.centring, sizes or (self.ny, self.nu)
         if self._file is None:
             rows, ids = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-            return TransitionTable(rows, ny, nu, ids, name or self.name, centring=centring)
-        file = scratch_table(ny, nu, blocks, self._file.folder.parent, centring)
-        return self._of(file, name or self.name, self._memory)
+            table = TransitionTable(rows, ny, nu, ids, name or self.name, centring=centring)
+        else:
+            file = scratch_table(ny, nu, blocks, self._file.folder.parent, centring)
+            table = self._of(file, name or self.name, self._memory)
+        table.names = self.names if sizes is None else ()
+        return table
 
     def check_fits(
         self, ny: int, nu: int, action_low: ArrayLike | None = None, action_high: ArrayLike | None = None
@@ -349,14 +356,7 @@ class TransitionTable:
         Raises:
             InvalidArgumentError: For another fraction, or fewer than two episodes.
         """
-        if not 0.0 < fraction < 1.0:
-            raise InvalidArgumentError("fraction", expected="a number in (0, 1)", actual=str(fraction))
-        episodes = self.episodes.ids
-        if len(episodes) < 2:
-            raise InvalidArgumentError(f"{self.name}: episodes", expected="two or more to split", actual="1")
-        count = min(max(1, round(fraction * len(episodes))), len(episodes) - 1)
-        first = np.random.default_rng(seed).permutation(episodes)[:count]
-        chosen = np.isin(self.episode_ids, first)
+        chosen = drawn_episodes(self.name, self.episode_ids, fraction, seed)
         return self._take(np.flatnonzero(chosen)), self._take(np.flatnonzero(~chosen))
 
     def batches(

@@ -26,9 +26,9 @@ def test_the_numbers_are_those_of_the_data(tmp_path: Path) -> None:
     assert found["cost L of a step"].quantiles == pytest.approx(np.percentile(costs, [0, 5, 50, 95, 100]))
     assert found["cost J of an episode"].mean == pytest.approx(costs.sum() / 4)
     first = np.concatenate([np.asarray(episode.observations)[:-1, 2] for episode in episodes])
-    assert found["observation[2]"].quantiles[4] == pytest.approx(first.max())
+    assert found["phid [rad/s]"].quantiles[4] == pytest.approx(first.max())
     assert found["steps of an episode"].quantiles == (30.0,) * 5
-    assert list(found)[:4] == ["observation[0]", "observation[1]", "observation[2]", "action[0]"]
+    assert list(found)[:4] == ["cos phi", "sin phi", "phid [rad/s]", "u [N m]"]
     assert summary.facts["episodes"] == "4 (2 terminated, 2 truncated)"
     assert summary.facts["algorithm"] == "random"
     assert summary.facts["environment"] == "mpcoffline/PendulumSwingUp-v0"
@@ -57,7 +57,7 @@ def test_any_other_environment_has_panels_too(tmp_path: Path) -> None:
     dataset = stored(env_spec=None)
     figure = coverage(dataset)
     labels = [(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes[:-1]]
-    assert labels == [("observation [0]", "observation [1]"), ("observation [0]", "action [0]")]
+    assert labels == [("observation[0]", "observation[1]"), ("observation[0]", "action[0]")]
     figure.savefig(tmp_path / "few.png")
     assert "environment" not in show(dataset).facts
 

@@ -13,6 +13,7 @@ from tank_logs import START, Log, simulated, stamps, text
 from two_tanks import two_tanks
 
 from mpcoffline import (
+    FileFormatError,
     Input,
     InvalidArgumentError,
     InvalidDataError,
@@ -22,6 +23,9 @@ from mpcoffline import (
     State,
     StorageError,
 )
+from mpcoffline.datasets.logs.collecting import Options
+from mpcoffline.datasets.logs.reading import read_log
+from mpcoffline.datasets.logs.wanted import Wanted
 
 pl = pytest.importorskip("polars")
 LOG = simulated()
@@ -404,6 +408,55 @@ def test_temperatures_have_an_offset(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows.costs, [1.0, 0.0], atol=1e-5)
 
 
+def german(log: Any, tags: str = "LI101 Oben [mm];LI102 Unten [cm];SC100 Pumpe [V];LC102 Sollwert [cm]") -> str:
+    """A log whose rows have text at both ends, so that a comma leaves no number whole."""
+    rows = [f"Zeit;{tags};Betriebsart"]
+    for k, values in enumerate(zip(10 * log.h1, log.h2, log.pump, log.set_point, strict=True)):
+        numbers = [f"{value:.3f}".replace(".", ",") for value in values]
+        rows.append(
+            ";".join([f"02.03.2026 06:{5 * k // 60:02}:{5 * k % 60:02}", *numbers, "HAND" if k < 2 else "AUTO"])
+        )
+    return "\n".join(rows) + "\n"
+
+
+def test_text_at_both_ends_of_a_row_hides_no_decimal_comma(tmp_path: Path, plant: Plant) -> None:
+    columns = {"h1": "LI101", "h2": "LI102", "pump": "SC100", "set_point": "lc102 Sollwert"}
+    table = plant.read(written(tmp_path, german(LOG)), columns=columns, where={"Betriebsart": "AUTO"})
+    np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[2:-1], atol=1e-3)
+    np.testing.assert_allclose(table.values().actions[:, 0], LOG.pump[2:-1], atol=1e-3)
+
+
+def test_a_description_says_what_logs_call_its_columns(tmp_path: Path) -> None:
+    described = two_tanks(columns={"h1": "LI101", "h2": "LI102", "pump": "SC100", "set_point": "LC102"})
+    for reader in (described.wanted, Wanted.from_json(described.wanted.to_json(described.cost_function))):
+        table = read_log(written(tmp_path, german(LOG)), reader, Options(where={"Betriebsart": "AUTO"}))
+        np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[2:-1], atol=1e-3)
+    assert len(described.read(written(tmp_path, text(LOG)))) == len(two_tanks().read(written(tmp_path, text(LOG))))
+    both = german(LOG).replace("LI102 Unten [cm]", "h1 [cm]")  # a column of its name is another one here
+    table = described.read(written(tmp_path, both), columns={"h2": "h1"})
+    np.testing.assert_allclose(table.values().observations[:, 0], LOG.h1[:-1], atol=1e-3)
+    with pytest.raises(InvalidDataError, match="column 'LI102': expected one among 'Zeit', "):
+        described.read(written(tmp_path, german(LOG).replace("LI102", "XX")))
+    with pytest.raises(InvalidArgumentError, match=r"columns: expected one of .*got 'h3'"):
+        two_tanks(columns={"h3": "LI103"})
+    with pytest.raises(InvalidArgumentError, match="columns: h1: expected a header of up to 200 characters"):
+        two_tanks(columns={"h1": " "})
+    wrong = described.wanted.to_json(described.cost_function)
+    wrong["states"][0]["header"] = "x" * 201
+    with pytest.raises(FileFormatError, match="header of h1"):
+        Wanted.from_json(wrong)
+
+
+def test_a_tag_of_two_columns_is_none_of_them(tmp_path: Path, plant: Plant) -> None:
+    log = written(tmp_path, german(LOG, "LI101 Oben [mm];LI101 Unten [cm];SC100 Pumpe [V];LC102 Sollwert [cm]"))
+    names = {"h2": "LI101 Unten", "pump": "SC100", "set_point": "LC102"}
+    with pytest.raises(InvalidDataError, match=r"column 'LI101': expected one column of that name, got 2: 'LI101 Oben"):
+        plant.read(log, columns={"h1": "LI101", **names})
+    with pytest.raises(InvalidDataError, match=r"columns of 'h1', 'LI10': .*Is it 'LI101") as refused:
+        plant.read(log, columns={**names, "h2": "LI10"})
+    assert "Zeit'?" not in str(refused.value)
+
+
 def test_previews_and_clocks_come_from_the_log() -> None:
     plant = two_tanks(signals=[Signal("set_point", "cm", preview=2), Signal("day", period=17280)])
     t = stamps(LOG)
@@ -431,6 +484,7 @@ def test_the_log_becomes_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     table = plant.read({"h1": LOG.h1, "h2": LOG.h2, "pump": LOG.pump, "set_point": LOG.set_point})
     again = TransitionTable.from_minari(table.to_minari("mine/tanks/log-v0"))
+    assert again.names == table.names == ("h1 [cm]", "h2 [cm]", "set_point [cm]", "pump [V]")
     np.testing.assert_allclose(again.values().next_observations, table.values().next_observations, rtol=1e-6)
     np.testing.assert_array_equal(again.episode_ids, table.episode_ids)
 

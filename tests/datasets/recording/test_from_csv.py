@@ -42,6 +42,7 @@ def test_the_log_of_a_plant(log: Path) -> None:
     assert list(table.episode_ids) == [0, 0, 1]
     assert not table.terminations.any()
     stored = TransitionTable.from_minari("test/plant-v0")
+    assert stored.names == table.names == ("x", "v", "u")
     np.testing.assert_array_equal(stored.rows, table.rows)
     np.testing.assert_array_equal(stored.episode_ids, table.episode_ids)
 
@@ -67,10 +68,26 @@ def test_costs_from_a_column_gaps_and_other_delimiters(tmp_path: Path) -> None:
     assert list(table.episode_ids) == [0, 1]
 
 
+def test_another_sampling_time_is_told_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("t,x,u\n" + "".join(f"{2 * k},{k},0\n" for k in range(9)))
+    arguments: dict[str, Any] = {"observations": ["x"], "actions": ["u"], "cost": "x", "time": "t"}
+    with pytest.raises(InvalidDataError, match=r"got 2 s \(8 such.*Rows are 2 s apart: pass dt=2\. .*resamples"):
+        from_csv(path, **arguments, dt=10.0)
+    assert len(from_csv(path, **arguments, dt=2.0)) == 8
+
+
+def test_headers_that_are_no_names_are_spelled(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("LI#101: PV,u\n1,0\n2,0\n")
+    table = from_csv(path, observations=["LI#101: PV"], actions=["u"], cost="u", dataset_id="test/plant-v0")
+    assert TransitionTable.from_minari("test/plant-v0").names == table.names == ("LI_101_ PV", "u")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("1.1,0.2", "1.1,oops", r"log.csv, line 3: column 'v': expected a finite number, got 'oops'"),
+        ("1.1,0.2", "1.1,oops", r"log.csv, line 3: column 'v': expected a finite number, got 'oops'.*Plant.read"),
         ("1.1,0.2", "nan,0.2", r"line 3: column 'x'.*got 'nan'"),
         ("1.1,0.2,0.4,", "1.1,0.2", r"line 3: expected 6 columns, got 4"),
         ("0.2,a", "0.25,a", r"line 4: t: expected 0.1 s more than the row before, got 0.15 s"),
