@@ -101,8 +101,8 @@ def learned_ends(table: TransitionTable, prices: Array, seed: int, seen: int) ->
     else:
         found = Ends(plain, price=price, count=count)
     hits, false = int(found(bad).sum()), int(found(good).sum())
-    good, share = _good_below(table.take(np.flatnonzero(~over))), false / max(hits + false, 1)
-    return replace(found, found=hits / count, wrong=share, prices=by_state, good_below=good)
+    below, share = _good_below(table.take(np.flatnonzero(~over))), false / max(hits + false, 1)
+    return replace(found, found=hits / count, wrong=share, prices=by_state, good_below=below)
 
 
 def _good_below(going: TransitionTable) -> float:
