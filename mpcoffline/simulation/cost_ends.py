@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,9 +101,8 @@ def learned_ends(table: TransitionTable, prices: Array, seed: int, seen: int) ->
     else:
         found = Ends(plain, price=price, count=count)
     hits, false = int(found(bad).sum()), int(found(good).sum())
-    shares = hits / count, false / max(hits + false, 1)
-    good_below = _good_below(table.take(np.flatnonzero(~over)))
-    return Ends(found.limits, *shares, price, count, found.features, found.weights, by_state, good_below)
+    below, share = _good_below(table.take(np.flatnonzero(~over))), false / max(hits + false, 1)
+    return replace(found, found=hits / count, wrong=share, prices=by_state, good_below=below)
 
 
 def _good_below(going: TransitionTable) -> float:
