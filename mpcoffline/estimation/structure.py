@@ -24,6 +24,8 @@ _SHORTEST = 5  # steps from which on more than one step is predicted
 _STARTS = 5  # windows begin so many times a length
 _FEWEST = 8  # windows that anything is said of
 _HELD_OUT = 0.25
+_UNEVEN = 0.1  # by which the share of the rows may differ from it
+_PIECES = 20  # of the rows, at least, where episodes are cut
 _FEW_EPISODES = 4
 _CLEAR = 2.0  # standard errors beyond which a difference is no chance
 _ROWS = 3_000
@@ -134,6 +136,9 @@ def _squares(problem: MultiStepProblem, z: Array) -> Array:
 class HeldOut(NamedTuple):
     """Episodes that nothing is fitted to; the last rows where there are hardly any episodes.
 
+    Where episodes are a few long stretches and many fragments, as in the log of a plant in operation, a quarter of them
+    may be hardly any row, or nearly all: then pieces of episodes, so many that they are a quarter of the rows.
+
     Attributes:
         rows: Whether a row of the table is one of them, ``(n,)``.
     """
@@ -142,7 +147,7 @@ class HeldOut(NamedTuple):
 
     @classmethod
     def of(cls, episodes: NDArray[np.integer[Any]], seed: int) -> HeldOut:
-        """A quarter of the episodes.
+        """A quarter of the episodes, or of the rows.
 
         Args:
             episodes: The episode of each row, ``(n,)``.
@@ -151,8 +156,17 @@ class HeldOut(NamedTuple):
         ids = np.unique(episodes)
         if len(ids) < _FEW_EPISODES:
             return cls(np.arange(len(episodes)) >= (1.0 - _HELD_OUT) * len(episodes))
-        chosen = np.random.default_rng(seed).permutation(ids)[: max(1, round(_HELD_OUT * len(ids)))]
-        return cls(np.isin(episodes, chosen))
+        rng = np.random.default_rng(seed)
+        rows = np.isin(episodes, rng.permutation(ids)[: max(1, round(_HELD_OUT * len(ids)))])
+        if abs(float(rows.mean()) - _HELD_OUT) <= _UNEVEN:
+            return cls(rows)
+        begins = np.append(True, episodes[1:] != episodes[:-1])
+        first = np.maximum.accumulate(np.where(begins, np.arange(len(episodes)), 0))
+        within = (np.arange(len(episodes)) - first) // -(-len(episodes) // _PIECES)
+        piece = np.cumsum(begins | np.append(False, within[1:] != within[:-1])) - 1
+        order = rng.permutation(int(piece[-1]) + 1)
+        enough = int(np.searchsorted(np.cumsum(np.bincount(piece)[order]), _HELD_OUT * len(episodes))) + 1
+        return cls(np.isin(piece, order[:enough]))
 
     def of_rows(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Whether these are held out."""

@@ -103,7 +103,14 @@ def _begins_as_usual(mpc: MPC, table: TransitionTable) -> bool:
 
 
 def _usual_length(table: TransitionTable) -> int:
-    """Steps of an episode of the log that was not ended by the plant; of the longest where all were."""
+    """Steps of an episode of the log that was not ended by the plant; of the longest where all were.
+
+    That of the episode in which half of the rows are reached, so that fragments of a log do not count as much as what
+    they were cut from.
+    """
     _, firsts, lengths = table.episodes
-    whole = lengths[np.asarray(table.terminations)[firsts + lengths - 1] == 0.0]
-    return int(np.median(whole)) if len(whole) else int(lengths.max())
+    whole = np.sort(lengths[np.asarray(table.terminations)[firsts + lengths - 1] == 0.0])
+    if not len(whole):
+        return int(lengths.max())
+    rows = np.cumsum(whole)
+    return int(whole[np.searchsorted(rows, 0.5 * rows[-1])])
