@@ -19,6 +19,7 @@ from .stages import ROUNDING, KnownCost
 
 _ROWS = 4_000
 _PARTS = (0.5, 0.75)  # of the rows: what is learned from, what chooses the shape, what judges
+_ROWS_A_NUMBER, _DIRECTIONS = 2, 6
 _RANDOM = 100
 _WORTH_MORE = 0.8  # times the squared error, for which all states are taken
 _TRIFLE = 1e-3  # of the variance
@@ -48,6 +49,10 @@ def normed_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | Non
     going = np.flatnonzero(columns.terminations == 0.0)
     cost = np.asarray(columns.costs[going], dtype=np.float64)
     s, a, after = (each[going] for each in (columns.observations, columns.actions, columns.next_observations))
+    once = np.unique(np.hstack([s, a, after, cost[:, None]]), axis=0, return_index=True)[
+        1
+    ]  # else they judge themselves
+    s, a, after, cost = (each[np.sort(once)] for each in (s, a, after, cost))
     spread = cost_spread(cost) if len(cost) else 0.0
     if not spread > 0.0:
         return None
@@ -57,6 +62,8 @@ def normed_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | Non
     unit, variance = (float(cost.mean()), spread), float(np.var(y))
     for reached, states in _views(mpc, s, after, a, y, parts):
         x = np.hstack([(after if reached else s)[:, states], a])
+        if len(parts[0]) < _ROWS_A_NUMBER * _numbers(x.shape[1]):
+            continue
         if _missed(RandomFeatures(x, 0, np.random.default_rng(0)), x, y, parts) <= ROUNDING * variance:
             return None
         data, ends = ((x[part], y[part]) for part in parts[:2])
@@ -66,6 +73,11 @@ def normed_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | Non
             stage = _stage_cost(norms, x, states, s.shape[1], mpc.nu, unit)
             return mpc.replace(stage_cost=stage), KnownCost(missed=missed, reached=reached, regressed=True)
     return None
+
+
+def _numbers(d: int) -> int:
+    """About how many are learned of d columns: a quadratic, and norms of several directions."""
+    return 1 + d + d * (d + 1) // 2 + _DIRECTIONS * (d + 1)
 
 
 def _rounding(table: TransitionTable, cost: Array, x: Array) -> float:

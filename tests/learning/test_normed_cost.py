@@ -108,6 +108,17 @@ def test_noise_is_no_norm(noise: float) -> None:
     assert agreeing_cost(mpc_of(), walks(noisy, reached=True)) is None
 
 
+@pytest.mark.parametrize("repeated", [1, 5])
+def test_of_a_few_rows_nothing_is_exact(repeated: int) -> None:
+    """A smooth cost that is no norm, of few rows, also where each is logged five times."""
+
+    def smooth(s: Array, u: Array) -> Array:
+        return np.log(1.0 + s[:, 0] ** 2 + s[:, 1] ** 2) + 0.1 * np.sum(u**2, axis=1)
+
+    few = walks(smooth, reached=False, n_episodes=4)
+    assert agreeing_cost(mpc_of(), TransitionTable.concat([few] * repeated)) is None
+
+
 def test_costs_of_the_state_reached_leave_the_last_to_the_terminal_cost() -> None:
     """sum_k L(x_k+1, u_k) = sum_k L(x_k, u_k) + Lx(x_N) - Lx(x_0)."""
     mpc, rng = mpc_of(), np.random.default_rng(0)

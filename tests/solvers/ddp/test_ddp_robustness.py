@@ -213,7 +213,7 @@ def test_iterations_are_bounded_and_said() -> None:
     mpc = nominal_mpc(CARTPOLE)
     x = random_states(CARTPOLE, 10)
     solution = DDPSolver(mpc, max_iterations=2).solve(x)
-    assert (solution.stats["iterations"] <= 2 * (16 + 4)).all()
+    assert (solution.stats["iterations"] <= 2 * (16 + 4 + 1)).all()  # starts, the best of them, a plan that stays
     assert "iteration limit" in solution.status
     honest(mpc, x, solution)
 
