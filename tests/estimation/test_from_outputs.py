@@ -211,7 +211,7 @@ def test_logs_that_cannot_be_are_named() -> None:
 def test_what_is_learned_from_angles_acts_on_angles_nearly_as_well_as_the_true_model() -> None:
     """Behind the same observer and noise: within 10 % of it, and better than the rough MPC."""
     true, rough = mpc_of(), mpc_of(0.6, 1.6, 0.15)
-    log, _ = log_of(true)
+    log, _ = log_of(true, n=20)
     found = identify_from_outputs(rough, log, [0], start_spread=[0.5, 0.5])
     learner = OfflineMPCLearner(rough, seed=0)
     learner.fit(found.table)
