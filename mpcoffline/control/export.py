@@ -251,8 +251,7 @@ _HEADER = """\
  * A step warm-started from the step before takes at most MPC_MAX_ITERATIONS iterations. The first after a reset, and
  * one that is not solved from its warm start, add at most 4 for each of MPC_STARTS starts, MPC_MAX_ITERATIONS + 4 for a
  * quarter of them, rounded up, and MPC_MAX_ITERATIONS for a plan that stays where the plant is. An iteration costs the
- * same each time, up to the 10 trial steps of its line
- * search.
+ * same each time, up to the 10 trial steps of its line search.
  */
 #ifndef MPC_CONTROLLER_H
 #define MPC_CONTROLLER_H

@@ -54,7 +54,7 @@ class OutputIdentification:
         names: Names of the parameters that were learned, ``(p,)``.
         deviations: Their standard deviations, in logarithms for those above zero, ``(p,)``.
         undetermined: Names of those of which the log hardly says anything: these stay near what was given.
-        seen: Share of each state's first variance that outputs remove along an episode, ``(n_states,)``.
+        seen: Share of each state's variance that outputs remove, of what there would be without them, ``(n_states,)``.
         table: The log with smoothed states in place of outputs: what a learner takes.
     """
 

@@ -180,7 +180,7 @@ def _ridge(P: Array) -> Array:
 
 
 def _parts(data: OutputEpisodes) -> Iterator[OutputEpisodes]:
-    """Some episodes at a time, of like length, in their order."""
+    """Some episodes at a time, in their order."""
     for begin in range(0, len(data.lengths), _CHUNK):
         some = slice(begin, begin + _CHUNK)
         T = int(data.lengths[some].max())

@@ -80,8 +80,7 @@ def priced_ends(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> End
     last = table.take(np.flatnonzero(np.asarray(table.terminations) > 0.0)).values()
     cost = KnownCost() if cost is None else cost
     ours = cost.stage_costs(mpc, last)
-    values = ((last.costs - cost.offset) / cost.scale - ours) / mpc.discount + cost.of_state(
-        mpc, last.next_observations
-    )
+    lacking = cost.of_state(mpc, last.next_observations)
+    values = ((last.costs - cost.offset) / cost.scale - ours) / mpc.discount + lacking
     states, before = (np.asarray(s, dtype=np.float64) for s in (last.next_observations, last.observations))
     return Ends(states, np.asarray(values, dtype=np.float64), before)

@@ -49,9 +49,8 @@ def normed_cost(mpc: MPC, table: TransitionTable) -> tuple[MPC, KnownCost] | Non
     going = np.flatnonzero(columns.terminations == 0.0)
     cost = np.asarray(columns.costs[going], dtype=np.float64)
     s, a, after = (each[going] for each in (columns.observations, columns.actions, columns.next_observations))
-    once = np.unique(np.hstack([s, a, after, cost[:, None]]), axis=0, return_index=True)[
-        1
-    ]  # else they judge themselves
+    # Rows that are logged again would be learned from and judged by.
+    _, once = np.unique(np.hstack([s, a, after, cost[:, None]]), axis=0, return_index=True)
     s, a, after, cost = (each[np.sort(once)] for each in (s, a, after, cost))
     spread = cost_spread(cost) if len(cost) else 0.0
     if not spread > 0.0:

@@ -121,7 +121,7 @@ class KnownCost:
 
         Costs of s+ are, along a plan, those of s but for the first, which no input changes, and the last, which is
         missing: ``sum_k Lhat(x_k+1,u_k) = sum_k Lhat(x_k,u_k) + Lx(x_N) - Lx(x_0)`` with Lx the part of Lhat that
-        depends on the state.
+        depends on the state, its value at inputs of zero: exact where states and inputs are not multiplied in Lhat.
         """
         if not self.reached:
             return np.zeros(len(s))
