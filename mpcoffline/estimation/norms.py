@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -17,6 +17,7 @@ from mpcoffline.mpc.scaling import spread_of
 _SHAPES = ((1, 3), (2, 3), (3, 1))  # norms, and how many directions each is of: a distance, two, absolute errors
 _EXACT = 1e-8  # of the variance of unit costs: no need to look further
 _STARTS = 4  # of each
+_FIRST_ITERATIONS, _FEW = 40, 3  # of all starts; those that go on
 _OPTIONS: Any = {"maxiter": 300, "maxcor": 30, "ftol": 1e-9, "gtol": 1e-8}
 _REFINING: Any = {"maxiter": 500, "maxfun": 2_000, "maxcor": 50, "ftol": 1e-12, "gtol": 1e-12}
 _NEARLY = 1e-4  # of the variance of unit costs, missed: may be exact
@@ -98,10 +99,15 @@ def fit_norms(data: tuple[Array, Array], ends: tuple[Array, Array], rng: np.rand
         x, y = x[kept], y[kept]
     features, mean, spread = RandomFeatures(x, 0, rng), x.mean(axis=0), spread_of(x)
     projected = _Projected(features(x), (x - mean) / spread, y)
+
+    def judged(parts: tuple[Array, Array, Array, Array]) -> tuple[float, Norms]:
+        norms = Norms(features, mean, spread, *parts)
+        return float(np.mean((norms(ends[0]) - ends[1]) ** 2)), norms
+
+    begun = [judged(projected.begun(directions, rng)) for directions in _starts(x.shape[1], rng)]
     found: list[tuple[float, Norms]] = []
-    for directions in _starts(x.shape[1], rng):
-        norms = Norms(features, mean, spread, *projected.solved(directions, rng))
-        found.append((float(np.mean((norms(ends[0]) - ends[1]) ** 2)), norms))
+    for _, norms in sorted(begun, key=lambda each: each[0])[:_FEW]:
+        found.append(judged(projected.solved(norms)))
         if found[-1][0] <= _EXACT:
             break
     missed, best = min(found, key=lambda each: each[0])
@@ -125,41 +131,37 @@ class _Projected:
         self._gram, self._slope = q.T @ q / len(q), q.T @ y / len(q)
         self._ridge = _RIDGE * float(np.trace(self._gram)) / len(self._gram)
 
-    def solved(self, directions: Array, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
-        """Directions, offsets, logarithms of widths and weights of norms, begun at directions ``(j, r, d)``."""
-        count, size, d = directions.shape
-        self._shapes: tuple[tuple[int, ...], ...] = (count, size, d), (count, size), (count,)
-        start = [
-            directions.ravel(),
-            0.3 * rng.standard_normal(count * size),
-            np.full(count, np.log(_WIDTH)),
-        ]
-        done = scipy.optimize.minimize(
-            self._error, np.concatenate(start), jac=True, method="L-BFGS-B", bounds=self._bounds(), options=_OPTIONS
-        )
-        return self._whole(done.x)
+    def begun(self, directions: Array, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+        """Directions, offsets, logarithms of widths and weights of norms, some steps from directions ``(j, r, d)``."""
+        count, size, _ = directions.shape
+        start = directions, 0.3 * rng.standard_normal((count, size)), np.full(count, np.log(_WIDTH))
+        return self._descended(self._error, start, _OPTIONS | {"maxiter": _FIRST_ITERATIONS})
+
+    def solved(self, norms: Norms) -> tuple[Array, Array, Array, Array]:
+        """The same, from what was begun."""
+        return self._descended(self._error, (norms.directions, norms.offsets, norms.widths), _OPTIONS)
 
     def refined(self, norms: Norms) -> tuple[Array, Array, Array, Array]:
-        """The same, begun at some that are nearly exact: what is exact becomes so to rounding, nothing else does.
+        """The same, from some that are nearly exact: what is exact becomes so to rounding, nothing else does.
 
         It is the logarithm of the error that falls, and hardly any weight is too large.
         """
-        start = norms.directions, norms.offsets, norms.widths
-        self._shapes, self._ridge = tuple(part.shape for part in start), self._ridge * _LIGHTER
+        self._ridge *= _LIGHTER
 
         def logarithm(p: Array) -> tuple[float, Array]:
             error, slope = self._error(p)
             error = max(error, np.finfo(np.float64).tiny)
             return float(np.log(error)), slope / error
 
-        done = scipy.optimize.minimize(
-            logarithm,
-            np.concatenate([part.ravel() for part in start]),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=self._bounds(),
-            options=_REFINING,
-        )
+        return self._descended(logarithm, (norms.directions, norms.offsets, norms.widths), _REFINING)
+
+    def _descended(
+        self, error: Callable[[Array], tuple[float, Array]], start: tuple[Array, Array, Array], options: Any
+    ) -> tuple[Array, Array, Array, Array]:
+        self._shapes: tuple[tuple[int, ...], ...] = tuple(part.shape for part in start)
+        first = np.concatenate([part.ravel() for part in start])
+        bounds = self._bounds()
+        done = scipy.optimize.minimize(error, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return self._whole(done.x)
 
     def _bounds(self) -> list[tuple[float | None, float | None]]:

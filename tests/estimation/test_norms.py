@@ -44,7 +44,7 @@ def test_noise_on_a_quadratic_is_no_norm() -> None:
 
 def test_the_error_has_the_gradient_it_says() -> None:
     problem = _Projected(np.hstack([np.ones((60, 1)), X[:60]]), X[:60], distance(X[:60]))
-    problem.solved(np.random.default_rng(1).normal(size=(2, 3, 5)), np.random.default_rng(1))
+    problem.begun(np.random.default_rng(1).normal(size=(2, 3, 5)), np.random.default_rng(1))
     p = np.random.default_rng(2).normal(size=2 * 3 * 5 + 2 * 3 + 2)
     assert scipy.optimize.check_grad(lambda q: problem._error(q)[0], lambda q: problem._error(q)[1], p) < 1e-6
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import lq_plant
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from mpcoffline.simulation.trials import Surroundings
 
 LOG = episodes()
 BEST = lq_plant.make_mpc((lq_plant.A, lq_plant.B)).replace(discount=1.0, horizon=20)
-JOBLIB = pytest.param("joblib", marks=pytest.mark.skipif(find_spec("joblib") is None, reason="needs joblib"))
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +33,11 @@ def mpcs() -> dict[str, MPC]:
     }
 
 
-@pytest.mark.parametrize("executor", ["processes", JOBLIB])
-def test_executors_give_the_same_trials(executor: str, around: Surroundings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_executor_gives_the_same_trials(around: Surroundings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(SETTING, raising=False)
     here, name = choose(mpcs(), around)
     told: list[tuple[int, int, str]] = []
-    monkeypatch.setenv(SETTING, executor)
+    monkeypatch.setenv(SETTING, "processes")
     there, other = choose(mpcs(), around, tell=lambda *what: told.append(what))
     assert name == other != FIRST
     assert here.names == there.names

@@ -44,7 +44,7 @@ def test_hostile_problems(seed: int, tellable: bool) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
-@pytest.mark.parametrize("seed", [0, 2, 8])
+@pytest.mark.parametrize("seed", [0, 8])
 def test_hostile_parameters_and_the_exported_c(seed: int, tmp_path: Path) -> None:
     """Claims are true by CasADi's functions; the C agrees, keeps its budget, and gives inputs in bounds for NaN."""
     _, mpc = hostile_problem(seed)
