@@ -15,7 +15,10 @@ from mpcoffline.core.archive import file_errors, read_archive, with_ending, writ
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.estimation.observer import Estimate, KalmanObserver
-from mpcoffline.mpc.expressions import function_from_json, function_to_json
+from mpcoffline.estimation.sensors import Sensors
+from mpcoffline.mpc import MPC
+from mpcoffline.solvers import Solver
+from mpcoffline.solvers.fallback import SolverStats
 
 from .course import Course, course_from
 from .observations import checked_observation
@@ -136,6 +139,21 @@ class OutputFeedbackPolicy(BasePolicy):
         known = Estimate(*state[:2])
         return self.observer.states(known), self.observer.disturbances(known)
 
+    @property
+    def mpc(self) -> MPC:
+        """The MPC that acts."""
+        return self.policy.mpc
+
+    @property
+    def solver(self) -> Solver:
+        """Its solver."""
+        return self.policy.solver
+
+    @property
+    def solver_stats(self) -> SolverStats:
+        """How its solves went."""
+        return self.policy.solver_stats
+
     def _predict(self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = True) -> torch.Tensor:
         if isinstance(observation, dict):
             raise InvalidArgumentError("observation", expected="a tensor", actual="a dictionary")
@@ -148,10 +166,7 @@ class OutputFeedbackPolicy(BasePolicy):
         Raises:
             InvalidArgumentError: As :meth:`mpcoffline.MPCPolicy.save`; or for outputs that are no plain arithmetic.
         """
-        observer = self.observer
-        disturbance = None if observer.disturbance is None else observer.disturbance.tolist()
-        numbers = {name: getattr(observer, name).tolist() for name in ("noise", "process", "start", "start_spread")}
-        known = numbers | {"outputs": function_to_json(observer.function), "disturbance": disturbance}
+        known = Sensors.of(self.observer).to_json()
         write_archive(path, "output_feedback", {"policy": self.policy.to_document(), "observer": known})
 
     @classmethod
@@ -165,9 +180,6 @@ class OutputFeedbackPolicy(BasePolicy):
         document, _ = read_archive(path, "output_feedback")
         with file_errors(path):
             policy = MPCPolicy.of_document(document["policy"])
-            known, n = dict(document["observer"]), policy.mpc.layout.n_states
-            function = function_from_json(known.pop("outputs"), "outputs", inputs=(n,))
-            observer = KalmanObserver(policy.mpc, lambda x: function(x), **known)
-            found = cls(policy, observer)
+            found = cls(policy, Sensors.from_json(document["observer"], policy.mpc).observer(policy.mpc))
         policy.use_options(solver_options)
         return found

@@ -14,7 +14,7 @@ from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import Identification
+from mpcoffline.estimation import Identification, OutputIdentification
 from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.learner.learner import OfflineMPCLearner
@@ -63,7 +63,7 @@ _FRESH = 1_000  # added to the seed: other models and starts than those of the c
 
 def diagnose(
     learner: OfflineMPCLearner,
-    dataset: MinariDataset | TransitionTable | str,
+    dataset: MinariDataset | TransitionTable | OutputIdentification | str,
     *,
     n_starts: int | None = None,
     n_steps: int | None = None,
@@ -85,7 +85,8 @@ def diagnose(
 
     Args:
         learner: A fitted learner.
-        dataset: What it was fitted on, or another log of the same plant.
+        dataset: What it was fitted on, or another log of the same plant. Where the policy sees outputs, what was found
+            in them, or a table with states.
         n_starts: Episodes simulated on each model; by default as in the choice, 64 or fewer.
         n_steps: Their length; by default that of the logged ones.
         seed: Seeds models, starts and noise.
@@ -108,6 +109,8 @@ def diagnose(
     chosen = FULL if learner.candidates is None else learner.candidates.chosen
     policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
     original, nominal = nominal, nominal.with_delay(learned.layout.delay)  # of the dead time that the learner has found
+    if isinstance(dataset, OutputIdentification):
+        dataset = dataset.table
     logged = TransitionTable.of(dataset)
     table = with_memory(logged, learned.layout)
     known = None if learner.result is None else learner.result.cost
@@ -124,14 +127,16 @@ def diagnose(
         n_starts=n_starts,
         n_steps=n_steps,
         seed=seed + _FRESH,
+        sensors=learner.sensors,
     )
+    acting_on = {name: around.seeing(policy) for name, policy in policies.items()}
     logs = around.logged
     own = _of_today(logs, today)
     clone = Behaviour.of(logs if own.all() else logs.take(np.flatnonzero(own)), learned.layout, seed)
     deviations = clone.deviations(logs, around.rows, around.n_steps)
     others = ~own[around.rows]  # of which nobody knows what today's controller would have done beside
     deviations[others], around.returns[others] = 0.0, np.nan
-    trials, loops = _tried(chosen, lambda starts: {**policies, TODAY: clone.replaying(deviations[starts])}, around)
+    trials, loops = _tried(chosen, lambda starts: {**acting_on, TODAY: clone.replaying(deviations[starts])}, around)
     first, second = loops[FIRST], loops[chosen]
     usual = np.flatnonzero(~others[: around.usual])
     rows, acting = around.rows[usual], clone.replaying(deviations[usual])

@@ -10,6 +10,7 @@ from .identifying import Identification, identify
 from .observer import KalmanObserver
 from .profiles import with_profiles
 from .residual import Residual, fit_residual, fit_residuals, with_residual
+from .sensors import Sensors
 from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
 from .structure import MultiStepCheck
 
@@ -23,6 +24,7 @@ __all__ = [
     "NoiseEstimate",
     "OutputIdentification",
     "Residual",
+    "Sensors",
     "estimate_noise",
     "find_delays",
     "fit_residual",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -26,6 +25,7 @@ from .output_episodes import (
     smoothed_states,
     with_states,
 )
+from .sensors import Sensors, listed
 
 _log = logging.getLogger(__name__)
 
@@ -46,57 +46,24 @@ class OutputIdentification:
 
     Attributes:
         mpc: The MPC with the identified model.
-        outputs: h, as it was given.
-        noise: Standard deviation of the error of each output, ``(n_outputs,)``.
-        process: Standard deviation of what the model misses of each state in a step, ``(n_states,)``.
-        start: Mean of the states where episodes begin, ``(n_states,)``.
-        start_spread: As it was given, ``(n_states,)``.
+        sensors: Outputs, their noise, what the model misses, where episodes begin; and of which parameters and states
+            the log hardly says anything: these stay near what was given.
         names: Names of the parameters that were learned, ``(p,)``.
         deviations: Their standard deviations, in logarithms for those above zero, ``(p,)``.
-        undetermined: Names of those of which the log hardly says anything: these stay near what was given.
         seen: Share of each state's variance that outputs remove, of what there would be without them, ``(n_states,)``.
         table: The log with smoothed states in place of outputs: what a learner takes.
     """
 
     mpc: MPC
-    outputs: Outputs
-    noise: Array
-    process: Array
-    start: Array
-    start_spread: Array
+    sensors: Sensors
     names: tuple[str, ...]
     deviations: Array
-    undetermined: tuple[str, ...]
     seen: Array
     table: TransitionTable
 
-    def observer(self, mpc: MPC | None = None, *, disturbance: ArrayLike | None = None) -> KalmanObserver:
-        """An observer with what was found, for an MPC that was learned from the table, or for this one.
-
-        Args:
-            mpc: The MPC that acts.
-            disturbance: See :class:`KalmanObserver`.
-        """
-        return KalmanObserver(
-            self.mpc if mpc is None else mpc,
-            self.outputs,
-            self.noise,
-            self.process,
-            start=self.start,
-            start_spread=self.start_spread,
-            disturbance=disturbance,
-        )
-
     def __str__(self) -> str:
         """What was found, in sentences."""
-        labels = self.mpc.layout.y_labels
-        hidden = [str(labels[i]) for i in np.flatnonzero(self.seen < _SEEN)]
-        said = [f"From outputs: noise {_listed(self.noise)}, the model misses {_listed(self.process)} a step."]
-        if self.undetermined:
-            said.append(f"The log hardly says anything of {', '.join(self.undetermined)}.")
-        if hidden:
-            said.append(f"Outputs hardly show {', '.join(hidden)}: what is learned of it is the model's word.")
-        return " ".join(said)
+        return f"{self.sensors} Their model misses {listed(self.sensors.process)} a step."
 
 
 def identify_from_outputs(
@@ -120,8 +87,8 @@ def identify_from_outputs(
 
     Example:
         >>> found = identify_from_outputs(mpc, log, [0], start_spread=[1.0, 0.5])
-        >>> learner.fit(found.table)
-        >>> policy = OutputFeedbackPolicy(learner.policy, found.observer(learner.mpc))
+        >>> learner.fit(found)
+        >>> action, state = learner.output_policy.predict(y)
 
     Args:
         mpc: Its model is the one to identify.
@@ -146,24 +113,16 @@ def identify_from_outputs(
     p = search.coordinates.size
     wide = np.sqrt(np.diag(np.linalg.pinv(curvature)))[:p]
     names = tuple(n for n, learned in zip(mpc.space.names, search.coordinates.mask, strict=True) if learned)
-    unknown = tuple(n for n, d in zip(names, wide, strict=True) if d > _UNKNOWN * _WIDTHS["parameters"])
+    unknown = [n for n, d in zip(names, wide, strict=True) if d > _UNKNOWN * _WIDTHS["parameters"]]
     identified = mpc.with_theta(canonical(mpc, found.theta))
     states, seen = smoothed_states(model, data, found, given.start_spread)
+    unknown += [f"{mpc.layout.y_labels[i]} (a state)" for i in np.flatnonzero(seen < _SEEN)]
+    parts = found.noise, found.process, found.start, given.start_spread
+    sensors = Sensors(model.function, *parts, undetermined=tuple(unknown))
+    deviations = wide * np.where(search.coordinates.logarithmic, 1.0, search.coordinates.scale)
     table = with_states(log, states, data, model.n_outputs)
-    result = OutputIdentification(
-        identified,
-        outputs,
-        found.noise,
-        found.process,
-        found.start,
-        given.start_spread,
-        names,
-        wide * np.where(search.coordinates.logarithmic, 1.0, search.coordinates.scale),
-        unknown,
-        seen,
-        table,
-    )
-    (_log.warning if unknown or (seen < _SEEN).any() else _log.info)("%s", result)
+    result = OutputIdentification(identified, sensors, names, deviations, seen, table)
+    (_log.warning if unknown else _log.info)("%s", result)
     return result
 
 
@@ -266,7 +225,3 @@ def _first_noise(data: OutputEpisodes) -> Array:
     spread = np.nanstd(data.y, axis=(0, 1))
     rough = np.nanstd(second, axis=(0, 1)) / np.sqrt(6.0) if len(second) else 0.1 * spread
     return np.asarray(np.maximum(rough, 1e-3 * spread))
-
-
-def _listed(values: Any) -> str:
-    return ", ".join(f"{v:.3g}" for v in values)

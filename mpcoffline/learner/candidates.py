@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.text import check_name, figure
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation import Sensors
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.back_offs import BackOffs, backed_off
@@ -219,7 +220,7 @@ def candidates_of(
                 logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
             return None
         how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
-        how |= {"kept": kept, "learned_in": learned_in}
+        how |= {"kept": kept, "learned_in": learned_in, "sensors": learner.sensors}
         how["ready"] = _as_it_is if soft is None else soft
         return tried(nominal, known, between, table, variants, show, **how)
     mpcs = {FIRST: nominal, **between, FULL: known.mpc}
@@ -245,6 +246,7 @@ def tried(
     ready: Callable[[MPC], MPC] = _as_it_is,
     kept: Kept | None = None,
     learned_in: float = 0.0,
+    sensors: Sensors | None = None,
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -260,13 +262,15 @@ def tried(
         ready: What becomes of each before it is tried.
         kept: What an interrupted search over the weights has found, and where more of it is kept.
         learned_in: How long the regressions took, in s of one core.
+        sensors: What the MPCs will see in place of states.
     """
     begun = core_seconds()
     mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
     slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
-    around = surroundings_of(known.mpc, nominal, table, known.found, slow=slow, choosing=True, seed=known.seed)
+    asked: dict[str, Any] = {"slow": slow, "choosing": True, "seed": known.seed, "sensors": sensors}
+    around = surroundings_of(known.mpc, nominal, table, known.found, **asked)
     around = various_first(around, mpcs[FIRST])
     trials, chosen = choose(mpcs, around, variants, tell, FULL)
     seconds, steps = {"the regressions": learned_in, "the choice": core_seconds() - begun}, [FIRST, FULL, chosen]
@@ -276,7 +280,7 @@ def tried(
         logger.log(logging.INFO if better.taken else logging.WARNING, "%s: %s", chosen, better.reason)
         if better.taken:
             mpcs, trials = {**mpcs, name: better.mpc}, trials.with_names([name])
-            trials.fill({name: quick_policy(better.mpc)}, around, slice(0, len(trials.rows)))
+            trials.fill({name: around.seeing(quick_policy(better.mpc))}, around, slice(0, len(trials.rows)))
             chosen = name if trials.improves(name) else chosen
         seconds["polishing"] = core_seconds() - begun
         steps.append(chosen)
@@ -285,7 +289,7 @@ def tried(
     if tighter is not None and tighter.mpc is not mpcs[chosen]:
         chosen += TIGHTER
         mpcs, trials = {**mpcs, chosen: tighter.mpc}, trials.with_names([chosen])
-        trials.fill({chosen: quick_policy(tighter.mpc)}, around, slice(0, len(trials.rows)))
+        trials.fill({chosen: around.seeing(quick_policy(tighter.mpc))}, around, slice(0, len(trials.rows)))
     found = Candidates(mpcs, chosen, trials, tighter, effort)
     if polish:
         logger.info("%s", effort)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from mpcoffline.core.archive import box_from_json, box_to_json, file_errors, read_archive, with_ending, write_archive
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.text import check_name
+from mpcoffline.estimation import Sensors
 from mpcoffline.learning import METHODS, FitResult, ValueFunction
 from mpcoffline.mpc import MPC
 
@@ -38,6 +39,7 @@ def write_learner(learner: OfflineMPCLearner, path: str | PathLike[str]) -> None
         "polish": learner.polish,
         "soften": learner.soften,
         "keep_limits": learner.keep_limits,
+        "sensors": None if learner.sensors is None else learner.sensors.to_json(),
         "start": None if learner.start is None else learner.start.to_json(),
         "candidates": None if learner.candidates is None else learner.candidates.to_json(),
         "observation_space": None if space is None else box_to_json(space),
@@ -69,6 +71,8 @@ def read_learner(cls: type[OfflineMPCLearner], path: str | PathLike[str]) -> Off
             learner.keep_limits = float(document["keep_limits"])
         if document.get("start") is not None:
             learner.start = MPC.from_json(document["start"])
+        if document.get("sensors") is not None:
+            learner.sensors = Sensors.from_json(document["sensors"], nominal)
         if document["candidates"] is not None:
             learner.candidates = Candidates.from_files(document["candidates"], arrays)
         if document["result"] is not None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from gymnasium import spaces
 
+from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
@@ -19,12 +20,14 @@ from mpcoffline.core.notebook import html_of
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation import OutputIdentification, Sensors
 from mpcoffline.estimation.consistency import check
 from mpcoffline.learning import FitResult, Known, Method, ValueFunction, ValueMethod
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.shown import parameter_table
 from mpcoffline.simulation.polishing import check_search
 
+from .callbacks import asks_to_end, check_callbacks
 from .candidates import Candidates, candidates_of, check_also
 from .checkpoint import Checkpoint, History
 from .effort import core_seconds
@@ -115,6 +118,7 @@ class OfflineMPCLearner:
         keep_limits: As given.
         candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
             where the method knows of none but the whole fit.
+        sensors: What ``output_policy`` sees in place of states; None where states were learned from.
     """
 
     def __init__(
@@ -159,6 +163,7 @@ class OfflineMPCLearner:
         self._mpc: MPC | Callable[[], MPC] | None = None  # while fitting, how to find it
         self._observation_space: spaces.Box | None = None
         self._policy: MPCPolicy | None = None
+        self.sensors: Sensors | None = None
 
     def __repr__(self) -> str:
         """What it learns, how, and whether it has."""
@@ -186,11 +191,12 @@ class OfflineMPCLearner:
             return ()
         chosen = () if self.candidates is None else (self.candidates.finding,)
         soft = softening_found(self.nominal_mpc, self._mpc)
-        return (*findings(self.nominal_mpc, self._mpc, self.result), *soft, *chosen)
+        seen = () if self.sensors is None else (str(self.sensors),)
+        return (*findings(self.nominal_mpc, self._mpc, self.result), *seen, *soft, *chosen)
 
     def fit(
         self,
-        dataset: MinariDataset | TransitionTable | str,
+        dataset: MinariDataset | TransitionTable | OutputIdentification | str,
         *,
         n_steps: int | None = None,
         n_steps_per_epoch: int | None = None,
@@ -206,7 +212,9 @@ class OfflineMPCLearner:
         First :func:`mpcoffline.check` compares the MPC with the data, and what it finds likely is logged as a warning.
 
         Args:
-            dataset: A Minari data set, the id of one, or a table of transitions.
+            dataset: A Minari data set, the id of one, a table of transitions, or what
+                :func:`~mpcoffline.estimation.identify_from_outputs` found in a log that holds outputs in place of
+                states: then candidates are tried behind an observer, and ``output_policy`` takes outputs.
             n_steps: Gradient steps of (VALUE), by far the longest part; the method's by default.
             n_steps_per_epoch: Steps between entries of the history; by default 500 in (VALUE) and 100 in (FIT).
             evaluators: Functions ``(learner, table) -> number`` by name, called at the end of each epoch from the first
@@ -220,7 +228,8 @@ class OfflineMPCLearner:
             show_progress: Whether to draw a progress bar.
             also: Further MPCs of this plant by name, as one that runs already: candidates beside what is learned.
             start: An MPC that was learned before, as from a part of the data: identification begins there, too, and
-                ends at the better minimum. What the data leave open stays near the given values.
+                ends at the better minimum. What the data leave open stays near the given values. What was found in
+                outputs by default.
 
         Returns:
             ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
@@ -249,7 +258,7 @@ class OfflineMPCLearner:
 
     def fitter(
         self,
-        dataset: MinariDataset | TransitionTable | str,
+        dataset: MinariDataset | TransitionTable | OutputIdentification | str,
         *,
         n_steps: int | None = None,
         n_steps_per_epoch: int | None = None,
@@ -271,6 +280,10 @@ class OfflineMPCLearner:
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
         method = self.method if n_steps is None else self.method.replaced({"value_n_steps": n_steps})
+        if isinstance(dataset, OutputIdentification):
+            self.sensors, start, dataset = dataset.sensors, start or dataset.mpc, dataset.table
+        else:
+            self.sensors = None
         table, observation_space = self._table(dataset)
         report = check(self.nominal_mpc, table)
         report.raise_for_errors()
@@ -300,7 +313,7 @@ class OfflineMPCLearner:
                 shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
                 bars.show(epoch.phase, epoch.step, epoch.n_steps, shown)
                 yield history[-1]
-                if any(_asks_to_end(answer) for answer in answers):
+                if any(asks_to_end(answer) for answer in answers):
                     break
             if run.learned is not None:
                 bars.busy("models of the log")
@@ -308,6 +321,8 @@ class OfflineMPCLearner:
                 self.candidates = candidates_of(self, run, table, bars, also or {}, kept, core_seconds() - begun)
                 self._policy = None
             self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
+            if self.sensors is not None and self._mpc is not None:
+                self.sensors = self.sensors.suited(self._mpc, table)
 
     @property
     def mpc(self) -> MPC:
@@ -348,6 +363,18 @@ class OfflineMPCLearner:
             self._policy = MPCPolicy(self.mpc, observation_space=self._observation_space)
         return self._policy
 
+    @property
+    def output_policy(self) -> OutputFeedbackPolicy:
+        """The same behind an observer: a policy that takes outputs in place of states.
+
+        Raises:
+            MPCOfflineError: Before ``fit``, and where it learned from states.
+        """
+        if self.sensors is None:
+            expected, hint = "a fit of outputs", "Call fit(identify_from_outputs(mpc, log, outputs, ...))."
+            raise MPCOfflineError("learner", expected=expected, actual="a log of states, or none", hint=hint)
+        return OutputFeedbackPolicy(self.policy, self.sensors.observer(self.policy.mpc))
+
     def _table(self, dataset: MinariDataset | TransitionTable | str) -> tuple[TransitionTable, spaces.Box | None]:
         if isinstance(dataset, TransitionTable):
             return dataset, None
@@ -377,24 +404,3 @@ class OfflineMPCLearner:
                 known here.
         """
         return read_learner(cls, path)
-
-
-def check_callbacks(callbacks: Sequence[object]) -> None:
-    """Refuses what cannot be called, before anything is learned.
-
-    Raises:
-        InvalidArgumentError: For one that is no function; SB3's are told how they become one.
-    """
-    for callback in callbacks:
-        if not callable(callback):
-            hint = "One of Stable-Baselines3's goes in as mpcoffline.sb3.SB3Callback(callback)."
-            expected = "functions (learner, epoch, total_step)"
-            raise InvalidArgumentError("callbacks", expected=expected, actual=repr(callback)[:200], hint=hint)
-
-
-def _asks_to_end(answer: Any) -> bool:
-    """Whether a callback's answer ends the fit: one that is false. None is no answer, nor are many of them at once."""
-    try:
-        return answer is not None and not answer
-    except (ValueError, RuntimeError):  # numpy's and torch's arrays of several
-        return False

@@ -121,7 +121,7 @@ def _missing(kept: Mapping[str, float], share: float) -> float:
 
 def _values(limit: LimitFunction, given: MPC, tried: MPC, around: Surroundings) -> Array:
     """H of the given limit in the closed loops of another MPC, ``(models, starts, T, n)``."""
-    (episodes,) = around.act([quick_policy(tried)], slice(0, around.usual), around.usual)
+    (episodes,) = around.act([around.seeing(quick_policy(tried))], slice(0, around.usual), around.usual)
     votes = around.models.votes
     return limit.along(episodes.states_kept[votes][:, :, :-1], episodes.actions_kept[votes], given.theta)
 

@@ -15,7 +15,7 @@ from mpcoffline.core.parallel import chosen, n_cpus
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import SOLVERS, CompilerError
 
-from .trials import Episodes, Surroundings, Trials
+from .trials import Controller, Episodes, Surroundings, Trials
 
 FIRST = "MPC_1"
 _SLOW = 10.0  # times as fast as ipopt
@@ -119,7 +119,7 @@ def various_first(around: Surroundings, mpc: MPC) -> Surroundings:
     """
     if not around.models.votes.any():
         return around
-    (done,) = around.act([quick_policy(mpc)], slice(0, around.usual))
+    (done,) = around.act([around.seeing(quick_policy(mpc))], slice(0, around.usual))
     cost = np.median(done.cost[around.models.votes], axis=0)
     dearest = np.argsort(-np.where(np.isnan(cost), np.inf, cost), kind="stable")
     digits = max(1, (len(cost) - 1).bit_length())
@@ -189,12 +189,12 @@ class _Acting:
 
     def __init__(self, around: Surroundings) -> None:
         self._around = around
-        self._policies: dict[str, MPCPolicy] = {}
+        self._policies: dict[str, Controller] = {}
 
     def __call__(self, job: _Act) -> list[Episodes]:
         for name, mpc in job.mpcs.items():
             if name not in self._policies:
-                self._policies[name] = quick_policy(mpc)
+                self._policies[name] = self._around.seeing(quick_policy(mpc))
         return self._around.act([self._policies[name] for name in job.mpcs], job.starts)
 
 

@@ -85,7 +85,7 @@ def polished(
         return Polished(mpc, False, 0.0, np.inf, 0, "not polished: no weights to move, or no model to do it on")
     tuning, judging = around.on(votes[::2]), around.on(votes[1::2] if len(votes) > 1 else votes)
     some = slice(0, min(_STARTS, len(around.rows) // 2))
-    base = tuning.act([quick_policy(mpc)], some)[0].cost.mean(axis=1)
+    base = tuning.act([tuning.seeing(quick_policy(mpc))], some)[0].cost.mean(axis=1)
     search = _search(max(2, len(groups)), seed)
     kept, name = {} if kept is None else kept, _name(mpc, around, seed)
     known = [gains for gains in kept.get(name, np.empty((0, _TOGETHER))) if gains.shape == (_TOGETHER,)]
@@ -94,7 +94,7 @@ def polished(
         drawn = search.ask()
         mpcs, batch = [_moved(mpc, groups, z) for z in drawn], count // _TOGETHER
         if batch == len(known):
-            done = tuning.act([quick_policy(each) for each in mpcs], some)
+            done = tuning.act([tuning.seeing(quick_policy(each)) for each in mpcs], some)
             known.append(np.array([_gain(base - each.cost.mean(axis=1)) for each in done]))
             kept[name] = np.stack(known)
         gains = known[batch]
@@ -105,7 +105,8 @@ def polished(
         tell(min(count, _EVALUATIONS), _EVALUATIONS, "weights")
     if best is mpc:
         return Polished(mpc, False, 0.0, np.inf, count, "not polished: no other weights cost less")
-    before, after = judging.act([quick_policy(mpc), quick_policy(best)], slice(some.stop, len(around.rows)))
+    tried = [judging.seeing(quick_policy(each)) for each in (mpc, best)]
+    before, after = judging.act(tried, slice(some.stop, len(around.rows)))
     return _judged(best, before, after, count)
 
 

@@ -8,6 +8,7 @@ from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, smooth
 from mpcoffline.estimation.plant import state_rows
+from mpcoffline.estimation.sensors import Sensors
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.seen import sees_memory
 
@@ -37,6 +38,7 @@ def surroundings_of(
     n_starts: int | None = None,
     n_steps: int | None = None,
     seed: int = 0,
+    sensors: Sensors | None = None,
 ) -> Surroundings:
     """Builds all that controllers are tried in.
 
@@ -51,6 +53,7 @@ def surroundings_of(
             where those of the log did; where it has fewer, in like states, too.
         n_steps: Their length; by default that of the logged ones that no end cut short, 400 at most.
         seed: Of models, starts and noise.
+        sensors: What MPCs see in place of states.
 
     Raises:
         InvalidDataError: If the data have other dimensions than the MPC.
@@ -81,8 +84,8 @@ def surroundings_of(
         n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
     n_before = mpc.layout.steps if len(clean) < len(table) else 0
     before = costs_before(table, clean, rows, n_before)
-    steps = max(1, n_steps - n_before)
-    return Surroundings(models, cost, clean, rows, steps, mpc.layout, seed, spare, before, n_before, logged, fresh)
+    parts = models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare
+    return Surroundings(*parts, before, n_before, logged, fresh, sensors)
 
 
 def _begins_as_usual(mpc: MPC, table: TransitionTable) -> bool:

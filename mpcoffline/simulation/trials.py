@@ -11,9 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.control.course import Course
+from mpcoffline.control.output_feedback import OutputFeedbackPolicy
+from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.estimation.sensors import Sensors
 from mpcoffline.mpc.layout import Layout
 from mpcoffline.solvers import Plan
 
@@ -42,7 +45,10 @@ class Controller(Protocol):
     """What acts, as :class:`~mpcoffline.control.policy.MPCPolicy` does."""
 
     def predict(self, observation: Any, state: Any = None) -> tuple[NDArray[Any], Any]:
-        """Inputs ``(B, nu)`` for observations ``(B, ny)``, and what the next call wants to know."""
+        """Inputs ``(B, nu)`` for observations ``(B, ny)``, and what the next call wants to know.
+
+        A :class:`~mpcoffline.control.OutputFeedbackPolicy` gets outputs in place of the plant's states.
+        """
 
 
 @dataclass(frozen=True)
@@ -204,6 +210,7 @@ class Surroundings:
         n_before: In how many steps.
         logged: The transitions as they were logged, where ``table`` is smoothed; its rows are those of the table.
         fresh: Whether a controller is not told which inputs were applied before an episode of the table begins.
+        sensors: What MPCs see in place of states, through an observer, which begins with the episode.
     """
 
     def __init__(
@@ -220,10 +227,11 @@ class Surroundings:
         n_before: int = 0,
         logged: TransitionTable | None = None,
         fresh: bool = False,
+        sensors: Sensors | None = None,
     ) -> None:
         self.logged = table if logged is None else logged
         self.models, self.cost, self.rows, self.n_steps, self._layout = models, cost, rows, n_steps, layout
-        self.usual, self.n_before, self.fresh = len(rows) - spare, n_before, fresh
+        self.table, self.usual, self.n_before, self.fresh = table, len(rows) - spare, n_before, fresh
         self.before = np.zeros(len(rows)) if before is None else before
         columns = table.values()
         self.starts = columns.observations[rows]
@@ -231,6 +239,9 @@ class Surroundings:
         self.disturbances = models.replayed(table, rows, n_steps, cost.as_applied)
         rng = np.random.default_rng([seed, _NOISE])
         self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
+        self.sensors = sensors
+        if sensors is not None:
+            self.output_noise = sensors.noise * rng.standard_normal((n_steps, len(rows), sensors.n_outputs))
         paid = table if cost.limits is None else cost.limits.whole(table)
         self.returns = returns_along(paid, rows, n_steps) + self.before
         self.begun = np.isin(rows, table.episodes.firsts)
@@ -252,7 +263,15 @@ class Surroundings:
         for name in ("rows", "before", "starts", "signals", "returns", "begun"):
             setattr(other, name, getattr(self, name)[order])
         other.disturbances, other.noise = self.disturbances[:, order], self.noise[:, order]
+        if self.sensors is not None:
+            other.output_noise = self.output_noise[:, order]
         return other
+
+    def seeing(self, policy: MPCPolicy) -> Controller:
+        """What acts on what sensors show: the policy itself where that is the state."""
+        if self.sensors is None:
+            return policy
+        return OutputFeedbackPolicy(policy, self.sensors.suited(policy.mpc, self.table).observer(policy.mpc))
 
     def begun_at(self, starts: Array, signals: Array) -> Surroundings:
         """The same models and disturbances from other starts, under other signals.
@@ -288,8 +307,10 @@ class Surroundings:
         for k in range(self.n_steps):
             seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
             seen[..., :n] += noise[k]
+            outputs = self._outputs(x, starts, k)
             for i, controller in enumerate(controllers):
-                found, courses[i] = controller.predict(seen[:, i].reshape(-1, ny), state=courses[i])
+                given = outputs if isinstance(controller, OutputFeedbackPolicy) else seen
+                found, courses[i] = controller.predict(given[:, i].reshape(-1, given.shape[-1]), state=courses[i])
                 u[:, i] = np.asarray(found, dtype=np.float64).reshape(m, len(begun), -1)
             flat = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
             reached = self.models.step(*(each.reshape(m, -1, each.shape[-1]) for each in (x, u))).reshape(x.shape)
@@ -320,13 +341,20 @@ class Surroundings:
             for i in range(c)
         ]
 
+    def _outputs(self, x: Array, starts: slice, k: int) -> Array:
+        """Outputs with noise and signals of states ``(..., starts, nx)`` in step k; nothing where states are seen."""
+        if self.sensors is None:
+            return x
+        n, ny = self._layout.n_states, self._layout.ny
+        return np.concatenate([self.sensors.seen(x[..., :n]) + self.output_noise[k, starts], x[..., n:ny]], axis=-1)
+
     def _course(self, controller: Controller, x: Array, begun: NDArray[np.bool_]) -> Course | None:
         """What a controller knows of the time before.
 
         In midst of an episode it is the inputs that were applied; where one begins, what the controller takes for them.
         """
         mpc, ny = getattr(controller, "mpc", None), self._layout.ny
-        if mpc is None or not mpc.nx == x.shape[2] > ny:
+        if mpc is None or isinstance(controller, OutputFeedbackPolicy) or not mpc.nx == x.shape[2] > ny:
             return None
         fresh = begun[:, None] & self.fresh
         past = np.where(fresh, mpc.layout.filled(mpc.usual_input), x[..., ny:]).reshape(-1, x.shape[2] - ny)

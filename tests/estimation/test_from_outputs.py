@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -11,7 +12,7 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-from mpcoffline import MPC, MPCPolicy, OfflineMPCLearner, TransitionTable
+from mpcoffline import MPC, MPCPolicy, OfflineMPCLearner, TransitionTable, diagnose
 from mpcoffline.control import OutputFeedbackPolicy
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.estimation import KalmanObserver, identify_from_outputs
@@ -139,19 +140,20 @@ def test_model_noise_and_speeds_are_found_from_angles(delay: int) -> None:
     for name, value, deviation in zip(found.names, learned, found.deviations, strict=True):
         assert abs(np.log(value / truth[name.removeprefix("model.")])) < 4.0 * deviation
         assert deviation < 0.03
-    assert found.noise[0] == pytest.approx(NOISE, rel=0.05)
-    assert found.process[1] == pytest.approx(PROCESS, rel=0.5)
-    assert (found.undetermined, (found.seen > 0.9).all()) == ((), True)
+    sensors = found.sensors
+    assert sensors.noise[0] == pytest.approx(NOISE, rel=0.05)
+    assert sensors.process[1] == pytest.approx(PROCESS, rel=0.5)
+    assert (sensors.undetermined, (found.seen > 0.9).all()) == ((), True)
     missed = found.table.values().observations.reshape(x.shape) - x
     assert np.sqrt(np.mean(missed**2, axis=(0, 1)))[0] < 0.5 * NOISE
     assert np.sqrt(np.mean(missed**2, axis=(0, 1)))[1] < 0.03
-    assert "noise 0.0" in str(found)
+    assert "1 output with a noise of 0.0" in str(found)
 
 
 def test_signals_stay_in_the_table() -> None:
     signals = [Signal("wind")]
-    log, _ = log_of(mpc_of(signals=signals))
-    found = identify_from_outputs(mpc_of(1.3, 0.8, signals=signals), log, [0], start_spread=[0.5, 0.5])
+    log, _ = log_of(mpc_of(signals=signals), n=20)
+    found = identify_from_outputs(mpc_of(1.2, 0.9, signals=signals), log, [0], start_spread=[0.5, 0.5])
     assert found.table.ny == 3
     np.testing.assert_array_equal(found.table.values().observations[:, 2], log.values().observations[:, 1])
     np.testing.assert_allclose(found.mpc.theta[found.mpc.space.mask(("model",))], [1.0, 1.0, 0.3], rtol=0.05)
@@ -175,11 +177,10 @@ def test_what_outputs_do_not_show_is_named(caplog: pytest.LogCaptureFixture) -> 
     log, _ = log_of(mpc_of(), n=10)
     with caplog.at_level(logging.WARNING):
         found = identify_from_outputs(mpc, log, [0], start_spread=[0.5, 0.5, 1.0])
-    assert found.undetermined == ("model.rate",)
+    assert found.sensors.undetermined == ("model.rate", "observation 2 (a state)")
     assert (found.seen[:2] > 0.9).all()
     assert found.seen[2] < 0.5
-    assert "hardly says anything of model.rate" in caplog.text
-    assert "Outputs hardly show observation 2" in caplog.text
+    assert "hardly says anything of model.rate, observation 2 (a state)" in caplog.text
 
 
 def test_the_same_seed_gives_the_same_numbers() -> None:
@@ -208,18 +209,17 @@ def test_logs_that_cannot_be_are_named() -> None:
 
 
 @pytest.mark.slow
-def test_what_is_learned_from_angles_acts_on_angles_nearly_as_well_as_the_true_model() -> None:
-    """Behind the same observer and noise: within 10 % of it, and better than the rough MPC."""
+def test_what_is_learned_from_angles_acts_on_angles_nearly_as_well_as_the_true_model(tmp_path: Path) -> None:
+    """Behind the same observer and noise: within 10 % of it, better than the rough MPC; and the verdict knows."""
     true, rough = mpc_of(), mpc_of(0.6, 1.6, 0.15)
-    log, _ = log_of(true, n=20)
+    log, states = log_of(true, n=20)
     found = identify_from_outputs(rough, log, [0], start_spread=[0.5, 0.5])
     learner = OfflineMPCLearner(rough, seed=0)
-    learner.fit(found.table)
+    learner.fit(found)
     known = {"noise": NOISE, "process": [1e-4, PROCESS], "start": [0.0, 0.0], "start_spread": [0.5, 0.5]}
 
-    def cost(mpc: MPC, observer: KalmanObserver) -> float:
-        policy, rng = OutputFeedbackPolicy(MPCPolicy(mpc), observer), np.random.default_rng(7)
-        x, state, total = rng.normal(0.0, 0.4, (20, 2)), None, 0.0
+    def cost(policy: OutputFeedbackPolicy, x: Array) -> float:
+        rng, state, total = np.random.default_rng(7), None, 0.0
         for _ in range(60):
             u, state = policy.predict(x[:, :1] + NOISE * rng.normal(size=(20, 1)), state)
             total += true.stage_function(x.T, u.T, true.theta).full().mean()
@@ -227,12 +227,19 @@ def test_what_is_learned_from_angles_acts_on_angles_nearly_as_well_as_the_true_m
             x[:, 1] += PROCESS * rng.normal(size=20)
         return total
 
-    best = replace_horizon(true)
-    learned = cost(learner.mpc, found.observer(learner.mpc))
-    yardstick, given = cost(best, KalmanObserver(best, [0], **known)), cost(rough, KalmanObserver(rough, [0], **known))
+    begun = np.random.default_rng(6).normal(0.0, 0.4, (20, 2))
+    best, learned = true.replace(horizon=40, discount=1.0), cost(learner.output_policy, begun)
+    yardstick, given = (
+        cost(OutputFeedbackPolicy(MPCPolicy(mpc), KalmanObserver(mpc, [0], **known)), begun) for mpc in (best, rough)
+    )
     assert learned < 1.1 * yardstick
     assert learned < given
-
-
-def replace_horizon(mpc: MPC) -> MPC:
-    return mpc.replace(horizon=40, discount=1.0)
+    report = diagnose(learner, found)
+    assert report.verdict == "recommend"
+    from_log = cost(learner.output_policy, states[:, 0])
+    assert report.judgement.expected[1] == pytest.approx(from_log, rel=0.05)
+    assert str(found.sensors) in report.findings
+    learner.save(tmp_path / "learner.zip")
+    again, y = OfflineMPCLearner.load(tmp_path / "learner.zip"), np.array([0.3])
+    np.testing.assert_array_equal(again.output_policy.predict(y)[0], learner.output_policy.predict(y)[0])
+    assert str(again.sensors) == str(learner.sensors)

@@ -6,7 +6,7 @@ import pytest
 from stable_baselines3.common.callbacks import CallbackList
 
 from mpcoffline import InvalidArgumentError
-from mpcoffline.learner.learner import check_callbacks
+from mpcoffline.learner.callbacks import check_callbacks
 
 
 def test_what_cannot_be_called_is_refused_with_the_way_out() -> None:

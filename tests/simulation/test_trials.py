@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import casadi as ca
 import lq_plant
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ from lq_plant import BEST
 from numpy.typing import NDArray
 
 from mpcoffline import MPCPolicy
+from mpcoffline.control import OutputFeedbackPolicy
 from mpcoffline.control.course import Course
 from mpcoffline.core.errors import FileFormatError
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.datasets.table.memory import with_memory
-from mpcoffline.estimation import identify
+from mpcoffline.estimation import Sensors, identify
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST, choose, various_first
@@ -32,6 +34,8 @@ Array = NDArray[np.float64]
 
 LOG = episodes()
 TRUE_MPC = lq_plant.make_mpc((lq_plant.A, lq_plant.B))
+_X = ca.SX.sym("x", 2)
+TRUE_MPC_OUTPUTS = ca.Function("outputs", [_X], [_X[0] + 2.0 * _X[1]])
 
 
 def place(mpc: MPC, log: TransitionTable, rows: list[int], n_steps: int, members: int = 0) -> Surroundings:
@@ -58,6 +62,33 @@ def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     some = around.act([MPCPolicy(TRUE_MPC)], slice(1, 3))[0]
     np.testing.assert_allclose(some.cost, done.cost[:, 1:3], rtol=1e-6)
     assert some.states_kept.shape[1] == 0
+
+
+def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller_states() -> None:
+    """Against a loop of its own: a Kalman filter from where episodes begin, and the same noise for each controller."""
+    noise, process, start = np.array([0.3]), np.array([0.05, 0.02]), np.array([1.0, -0.5])
+    sensors = Sensors(TRUE_MPC_OUTPUTS, noise, process, start, np.array([2.0, 2.0]))
+    rows, n_steps = np.array([0, 30, 60]), 25
+    models = LogModels.of(TRUE_MPC, LOG, identify_one_step(TRUE_MPC, LOG), n_perturbed=2, n_residual=0)
+    cost = LoggedCost(LOG, seen=2)
+    around = Surroundings(models, cost, LOG, rows, n_steps, TRUE_MPC.layout, seed=4, sensors=sensors)
+    plain = Surroundings(models, cost, LOG, rows, n_steps, TRUE_MPC.layout, seed=4)
+    controller = around.seeing(MPCPolicy(TRUE_MPC))
+    assert isinstance(controller, OutputFeedbackPolicy)
+    behind, seeing = around.act([controller, MPCPolicy(TRUE_MPC)], kept=3)
+    np.testing.assert_array_equal(seeing.cost, plain.act([MPCPolicy(TRUE_MPC)])[0].cost)
+    for m in range(len(models)):
+        x, state, expected = LOG.observations[rows].astype(np.float64), None, np.zeros(3)
+        policy = OutputFeedbackPolicy(MPCPolicy(TRUE_MPC), sensors.observer(TRUE_MPC))
+        for k in range(n_steps):
+            y = x[:, :1] + 2.0 * x[:, 1:] + around.output_noise[k]
+            u, state = policy.predict(y, state)
+            reached = models.step(np.tile(x, (len(models), 1, 1)), np.tile(u, (len(models), 1, 1)))[m]
+            reached += around.disturbances[m, :, k]
+            expected += cost(x, u.astype(np.float64), reached)
+            x = reached
+        np.testing.assert_allclose(behind.cost[m], expected, rtol=1e-6)
+    assert around.reordered(np.array([2, 0, 1])).output_noise[3, 0] == around.output_noise[3, 2]
 
 
 def test_a_disturbance_of_the_log_meets_every_controller_again() -> None:
