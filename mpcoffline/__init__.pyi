@@ -37,6 +37,7 @@ from .mpc import (
 from .plants import (
     Input as Input,
     Limit as Limit,
+    Output as Output,
     Plant as Plant,
     State as State,
     load_plant as load_plant,

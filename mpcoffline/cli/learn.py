@@ -234,8 +234,10 @@ def _of_plant(
     """Logs, or a data set, and MPC_1 of a plant file."""
     from mpcoffline.datasets import load_dataset
     from mpcoffline.plants import load_plant
+    from mpcoffline.plants.outputs import check_measured
 
     plant = load_plant(file)
+    check_measured(plant, "learn")
     return plant.read(logs, **reading) if dataset is None else load_dataset(dataset), plant.mpc()
 
 

@@ -31,7 +31,9 @@ _log = logging.getLogger(__name__)
 
 _ROWS = 2_000  # that parameters are searched on
 _LONGEST = 100  # steps of a stretch there
-_STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 60
+_STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 40
+_NEWTON, _SHORTER = 8, 2.0 ** -np.arange(8)  # iterations at the end; what of a step is tried
+_FLAT, _DONE = 1e-9, 1e-3  # of the largest curvature; by how much the logarithm falls at the end
 _AWAY = 0.7  # standard deviation of the starts, in logarithms or scaled coordinates
 _PROCESS = 0.01  # of the spread of starts: what the model is first taken to miss in a step
 _WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of the priors
@@ -111,7 +113,8 @@ def identify_from_outputs(
     v = search.best(seed)
     found, curvature = search.found(v), search.curvature(v)
     p = search.coordinates.size
-    wide = np.sqrt(np.diag(np.linalg.pinv(curvature)))[:p]
+    variances = np.diag(np.linalg.pinv(curvature))[:p]
+    wide = np.sqrt(np.where(variances > 0.0, variances, np.inf))  # no minimum along it: nothing is known
     names = tuple(n for n, learned in zip(mpc.space.names, search.coordinates.mask, strict=True) if learned)
     unknown = [n for n, d in zip(names, wide, strict=True) if d > _UNKNOWN * _WIDTHS["parameters"]]
     identified = mpc.with_theta(canonical(mpc, found.theta))
@@ -187,7 +190,29 @@ class _Search:
         starts = [np.zeros(size), *(away * rng.standard_normal(size) for _ in range(_STARTS - 1))]
         starts[0][: self.coordinates.size] = self.coordinates.start
         tried = [self._descended(np.clip(v, self._bounds.lb, self._bounds.ub), _FIRST_ITERATIONS) for v in starts]
-        return self._descended(min(tried, key=lambda each: each[1])[0], _ITERATIONS)[0]
+        return self._settled(self._descended(min(tried, key=lambda each: each[1])[0], _ITERATIONS)[0])
+
+    def _settled(self, v: Array) -> Array:
+        """The minimum near v by Newton's method: along narrow valleys, where parameters are told apart by little.
+
+        Curvatures count by their size, steps are as short as they must be.
+        """
+        value = float(self.loss(v[None])[0])
+        for _ in range(_NEWTON):
+            steps = _STEP * np.eye(len(v))
+            ahead, behind = np.split(self.loss(np.vstack([v + steps, v - steps])), 2)
+            curvatures, axes = np.linalg.eigh(self.curvature(v))
+            sizes = np.maximum(np.abs(curvatures), _FLAT * np.abs(curvatures).max())
+            step = -axes @ (axes.T @ (ahead - behind) / (2.0 * _STEP) / sizes)
+            points = np.clip(v + _SHORTER[:, None] * step, self._bounds.lb, self._bounds.ub)
+            losses = self.loss(points)
+            best = int(np.argmin(losses))
+            if not losses[best] < value:
+                break
+            v, fallen, value = points[best], value - float(losses[best]), float(losses[best])
+            if fallen < _DONE:
+                break
+        return v
 
     def _descended(self, v: Array, iterations: int) -> tuple[Array, float]:
         done = scipy.optimize.minimize(

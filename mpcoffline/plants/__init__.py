@@ -5,7 +5,8 @@ from __future__ import annotations
 from .description import Plant
 from .environment import PlantEnv
 from .nominal import nominal_mpc
+from .outputs import Output
 from .plant_file import load_plant
 from .quantities import Input, Limit, State
 
-__all__ = ["Input", "Limit", "Plant", "PlantEnv", "State", "load_plant", "nominal_mpc"]
+__all__ = ["Input", "Limit", "Output", "Plant", "PlantEnv", "State", "load_plant", "nominal_mpc"]

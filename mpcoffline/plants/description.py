@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.limits import HEADER
 from mpcoffline.core.text import check_name
 from mpcoffline.core.types import Array
-from mpcoffline.mpc import MPC, Parameter, Signal
+from mpcoffline.mpc import MPC, Signal
 from mpcoffline.mpc.labels import Label, Labels
 
 from .calling import arguments_of, called, column, number
-from .quantities import Input, Limit, State, Values, check_identifier
+from .outputs import checked_outputs, identified, outputs_function
+from .quantities import Input, Limit, State, Values, checked_parameter, with_usual
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
     from mpcoffline.datasets.logs.reading import LoggedTable
     from mpcoffline.datasets.logs.wanted import Wanted
-
-_WIDE = 100.0  # times and parts of its value that a parameter may become where nothing is said
+    from mpcoffline.datasets.table.transitions import TransitionTable
+    from mpcoffline.estimation import OutputIdentification
 
 Function = Callable[..., Any]
 
@@ -58,7 +58,7 @@ class Plant:
     Args:
         name: What it is called.
         dt: Control interval in s.
-        states: What is measured.
+        states: What the equations move; measured, where there are no outputs.
         inputs: What the controller sets.
         dynamics: The time derivatives of the states (per second), a list in their order or a mapping by name; with
             ``discrete`` their values one control interval later.
@@ -72,8 +72,10 @@ class Plant:
             default.
         changes: With weights, what squares of changes of inputs from step to step cost; nothing by default.
         limits: What the controller has to keep besides the bounds and rates of inputs; nothing by default.
-        columns: What logs call states, inputs and signals where that is not their name: headers, or their first words
-            as ``{"h1": "LI-101"}``.
+        outputs: What is measured in place of all states: names of these, and :class:`~mpcoffline.Output` with functions
+            of them. Logs and environments hold outputs then; :meth:`identify` estimates the states.
+        columns: What logs call what is measured, inputs and signals where that is not their name: headers, or their
+            first words as ``{"h1": "LI-101"}``.
         discrete: Whether ``dynamics`` gives the next state.
         integrator: How it is integrated otherwise, see :class:`~mpcoffline.Model`.
         horizon: Steps that its MPC looks ahead.
@@ -95,6 +97,7 @@ class Plant:
     references: Mapping[str, float | str] = field(kw_only=True, default_factory=dict)
     changes: Mapping[str, float] = field(kw_only=True, default_factory=dict)
     limits: Sequence[Limit] = field(kw_only=True, default=())
+    outputs: Sequence[Any] = field(kw_only=True, default=())
     columns: Mapping[str, str] = field(kw_only=True, default_factory=dict)
     discrete: bool = field(kw_only=True, default=False)
     integrator: str = field(kw_only=True, default="auto")
@@ -112,8 +115,9 @@ class Plant:
         for kind in ("states", "inputs"):
             if not getattr(self, kind):
                 raise InvalidArgumentError(kind, expected="one or more", actual="none")
-        object.__setattr__(self, "parameters", {n: _parameter(n, p) for n, p in dict(self.parameters).items()})
-        object.__setattr__(self, "signals", tuple(_with_usual(signal) for signal in self.signals))
+        object.__setattr__(self, "parameters", {n: checked_parameter(n, p) for n, p in dict(self.parameters).items()})
+        object.__setattr__(self, "signals", tuple(with_usual(signal) for signal in self.signals))
+        object.__setattr__(self, "outputs", checked_outputs(self, self.outputs))
         quantities: tuple[Any, ...] = (*self.states, *self.inputs, *self.signals)
         names = [each.name for each in quantities] + list(self.parameters)
         if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -123,15 +127,20 @@ class Plant:
         for limit in self.limits:
             if isinstance(limit.of, str) and limit.of not in (known := self.names("states") + self.names("inputs")):
                 raise _unknown(f"limit {limit.name!r}: of", limit.of, known)
-        _ = self.rates_function, self.cost_function  # what is wrong in them is told now
+        _ = self.rates_function, self.cost_function, self.outputs_function  # what is wrong in them is told now
         self.mpc()
 
     def names(self, kind: str) -> list[str]:
         """The names of its ``"states"``, ``"inputs"`` or ``"signals"``."""
         return [each.name for each in getattr(self, kind)]
 
+    @property
+    def measured(self) -> tuple[Any, ...]:
+        """What sensors show: its outputs, or its states where it has none."""
+        return tuple(self.outputs or self.states)
+
     def _check_columns(self) -> None:
-        known = [name for kind in ("states", "inputs", "signals") for name in self.names(kind)]
+        known = [q.name for q in self.measured] + self.names("inputs") + self.names("signals")
         for name, header in dict(self.columns).items():
             if name not in known:
                 raise _unknown("columns", name, known)
@@ -228,6 +237,11 @@ class Plant:
         price = self.price(_split(x), _split(u), _split(d), _split(u - before))
         return ca.Function("cost", [x, u, d, before], [price])
 
+    @cached_property
+    def outputs_function(self) -> ca.Function:
+        """What sensors show of the states as CasADi function ``x -> y``, without noise."""
+        return outputs_function(self)
+
     def costs(self, x: Array, u: Array, d: Array, before: Array) -> Array:
         """The stage cost of many steps ``(n,)``.
 
@@ -316,12 +330,36 @@ class Plant:
         from mpcoffline.datasets.logs.columns import Quantity
         from mpcoffline.datasets.logs.wanted import Wanted
 
-        states, inputs, signals = (
+        measured, inputs, signals = (
             [Quantity(q.name, q.unit, q.low, q.high, self.columns.get(q.name, "")) for q in each]
-            for each in (self.states, self.inputs, self.signals)
+            for each in (self.measured, self.inputs, self.signals)
         )
         previews, periods = [s.preview for s in self.signals], [s.period for s in self.signals]
-        return Wanted(self.dt, states, inputs, signals, previews, periods, self.costs)
+        # Outputs do not tell what a step cost: that is known when the states are.
+        costs = (lambda y, *_: np.zeros(len(y))) if self.outputs else self.costs
+        return Wanted(self.dt, measured, inputs, signals, previews, periods, costs)
+
+    def identify(self, log: TransitionTable, *, seed: int = 0) -> OutputIdentification:
+        """Model, noise and states from a log of its outputs, with what the plant's cost says of these states.
+
+        Where episodes begin, states are taken to be anywhere in their ``start``.
+
+        Example:
+            >>> found = plant.identify(plant.read("log.csv"))
+            >>> learner = OfflineMPCLearner(plant.mpc())
+            >>> learner.fit(found)
+            >>> action, state = learner.output_policy.predict(outputs)
+
+        Args:
+            log: Transitions of its outputs, as :meth:`read` or a data set of its environment gives them.
+            seed: Of the search.
+
+        Raises:
+            InvalidArgumentError: For a plant without outputs, or a state that nobody measures and whose ``start`` is
+                one number.
+            InvalidDataError: As :func:`~mpcoffline.estimation.identify_from_outputs`.
+        """
+        return identified(self, log, seed)
 
     def env(self, **options: Any) -> gym.Env[Any, Any]:
         """A Gymnasium environment that simulates this plant.
@@ -346,30 +384,6 @@ def _listed(kind: str, given: object, cls: type[Any]) -> tuple[Any, ...]:
 def _unknown(what: str, given: str, known: Sequence[str]) -> InvalidArgumentError:
     error = UnknownIdError.of(what, given, known)
     return InvalidArgumentError(what, expected=error.expected, actual=error.actual, hint=error.hint)
-
-
-def _parameter(name: str, given: Parameter | ArrayLike) -> Parameter:
-    """A parameter with bounds, of its own sign where nothing else is said."""
-    check_identifier("name of a parameter", name)
-    try:
-        found = given if isinstance(given, Parameter) else Parameter(given)
-        value, bounds = np.asarray(found.value, dtype=np.float64), np.array([found.low, found.high], dtype=np.float64)
-    except (InvalidArgumentError, TypeError, ValueError) as error:
-        raise InvalidArgumentError(f"parameter {name}", expected="a number", actual=repr(given)[:200]) from error
-    if value.shape or bounds.shape != (2,):
-        raise InvalidArgumentError(f"parameter {name}", expected="one number", actual=f"shape {value.shape}")
-    if np.isinf(bounds).all() and value != 0.0:
-        low, high = sorted((float(value) / _WIDE, float(value) * _WIDE))
-        return replace(found, low=low, high=high)
-    return found
-
-
-def _with_usual(signal: Signal) -> Signal:
-    """A signal whose usual value is one that it may have."""
-    if signal.low <= signal.usual <= signal.high:
-        return signal
-    ends = [end for end in (signal.low, signal.high) if math.isfinite(end)]
-    return replace(signal, usual=sum(ends) / len(ends))
 
 
 def _split(column_of: ca.SX) -> list[ca.SX]:

@@ -33,9 +33,10 @@ _DESCRIBED: dict[str, Plant] = {}
 class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """A simulated plant: its own equations, with other parameters each episode and noise on what is measured.
 
-    The observation is [states, signals], float32; the action one number an input; the reward minus the plant's cost.
-    ``info`` holds ``"cost"`` (float64), ``"state"`` (the true states, without noise), ``"applied"`` (the inputs after
-    bounds and rates), and at the start ``"parameters"``. Episodes are cut off after the plant's ``steps``.
+    The observation is [states, signals], float32, with outputs in place of states where the plant has some; the action
+    one number an input; the reward minus the plant's cost. ``info`` holds ``"cost"`` (float64), ``"state"`` (the true
+    states, without noise), ``"applied"`` (the inputs after bounds and rates), and at the start ``"parameters"``.
+    Episodes are cut off after the plant's ``steps``.
 
     * Parameters are drawn uniformly within ``spread`` of theirs and their bounds, anew each episode.
     * States begin uniformly in ``starts`` of each :class:`~mpcoffline.State`, and stay within the range of the state.
@@ -47,7 +48,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Args:
         plant: Name of a plant that was described in this process.
-        noise: Times the noise of each state; 0 for none.
+        noise: Times the noise of each state or output; 0 for none.
         spread: Times the spread of each parameter; 0 for the described ones.
         signals: Courses of signals by name.
 
@@ -76,7 +77,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         for name in self._courses:
             if name not in (known := self.plant.names("signals")):
                 raise UnknownIdError.of("signal", name, known)
-        self._spread, self._deviation = spread, noise * np.array([each.deviation for each in self.plant.states])
+        self._spread, self._deviation = spread, noise * np.array([each.deviation for each in self.plant.measured])
         self._model = self.plant.mpc().model
         self._low, self._high = self.plant.action_bounds
         if not (np.isfinite(self._low).all() and np.isfinite(self._high).all()):
@@ -87,7 +88,8 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._range = tuple(np.array([getattr(each, end) for each in states]) for end in ("low", "high"))
         clocks = {True: (-1.0, 1.0)}
         outside = [clocks.get(s.period is not None, (s.low, s.high)) for s in self.plant.signals for _ in range(s.size)]
-        low, high = (np.append(own, [pair[i] for pair in outside]) for i, own in enumerate(self._range))
+        shown = [[getattr(each, end) for each in self.plant.measured] for end in ("low", "high")]
+        low, high = (np.append(own, [pair[i] for pair in outside]) for i, own in enumerate(shown))
         self._shown = low.astype(np.float32), high.astype(np.float32)
         self.observation_space = spaces.Box(*self._shown, dtype=np.float32)
         self.action_space = spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32), dtype=np.float32)
@@ -153,8 +155,10 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._observed(), -cost, False, False, info
 
     def _observed(self) -> NDArray[np.float32]:
-        x: Any = self._x
-        measured = x + self._deviation * self.np_random.standard_normal(len(x))
+        exact: Any = self._x
+        if self.plant.outputs:
+            exact = self.plant.outputs_function(exact).full().ravel()
+        measured = exact + self._deviation * self.np_random.standard_normal(len(exact))
         values = np.concatenate([measured, *(signal.now(self._k) for signal in self._signals)]).astype(np.float32)
         return np.clip(values, *self._shown)
 

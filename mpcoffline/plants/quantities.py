@@ -5,16 +5,19 @@ from __future__ import annotations
 import keyword
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.text import check_name, check_unit
+from mpcoffline.mpc import Parameter, Signal
 
 _NOISE = 0.005  # of a state's range
+_WIDE = 100.0  # times and parts of its value that a parameter may become where nothing is said
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class State:
     noise: float | None = None
 
     def __post_init__(self) -> None:
-        _check_quantity("state", self)
+        check_quantity("state", self)
         if self.noise is not None:
             check_number(f"state {self.name}: noise", self.noise, 0.0, open_low=False)
         low, high = self.starts
@@ -95,7 +98,7 @@ class Input:
     usual: float | None = None
 
     def __post_init__(self) -> None:
-        _check_quantity("input", self)
+        check_quantity("input", self)
         if self.rate is not None:
             check_number(f"input {self.name}: rate", self.rate, 0.0)
         if self.delay is not None:
@@ -152,8 +155,33 @@ class Limit:
             raise InvalidArgumentError(what, expected="low <= high, one of them", actual=f"{self.low} and {self.high}")
 
 
-def _check_quantity(kind: str, quantity: State | Input) -> None:
-    check_identifier(f"name of {'an' if kind == 'input' else 'a'} {kind}", quantity.name)
+class Described(Protocol):
+    """A quantity with a name, a unit and a range."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def unit(self) -> str:
+        """Its unit."""
+
+    @property
+    def low(self) -> float:
+        """The least that it may be."""
+
+    @property
+    def high(self) -> float:
+        """The largest."""
+
+
+def check_quantity(kind: str, quantity: Described) -> None:
+    """Refuses a name, unit or range that is none.
+
+    Raises:
+        InvalidArgumentError: For these.
+    """
+    check_identifier(f"name of {'a' if kind == 'state' else 'an'} {kind}", quantity.name)
     check_unit(f"{kind} {quantity.name}: unit", quantity.unit)
     for bound in (quantity.low, quantity.high):
         if isinstance(bound, bool) or not isinstance(bound, int | float | np.number) or math.isnan(bound):
@@ -173,6 +201,34 @@ def check_identifier(what: str, name: object) -> None:
     if not str(name).isidentifier() or keyword.iskeyword(str(name)) or str(name).startswith("_"):
         hint = "Dynamics and cost call it by this name, as x.level or u.valve."
         raise InvalidArgumentError(what, expected="a Python identifier", actual=repr(name), hint=hint)
+
+
+def checked_parameter(name: str, given: Parameter | ArrayLike) -> Parameter:
+    """A parameter with bounds, of its own sign where nothing else is said.
+
+    Raises:
+        InvalidArgumentError: For what is no number.
+    """
+    check_identifier("name of a parameter", name)
+    try:
+        found = given if isinstance(given, Parameter) else Parameter(given)
+        value, bounds = np.asarray(found.value, dtype=np.float64), np.array([found.low, found.high], dtype=np.float64)
+    except (InvalidArgumentError, TypeError, ValueError) as error:
+        raise InvalidArgumentError(f"parameter {name}", expected="a number", actual=repr(given)[:200]) from error
+    if value.shape or bounds.shape != (2,):
+        raise InvalidArgumentError(f"parameter {name}", expected="one number", actual=f"shape {value.shape}")
+    if np.isinf(bounds).all() and value != 0.0:
+        low, high = sorted((float(value) / _WIDE, float(value) * _WIDE))
+        return replace(found, low=low, high=high)
+    return found
+
+
+def with_usual(signal: Signal) -> Signal:
+    """A signal whose usual value is one that it may have."""
+    if signal.low <= signal.usual <= signal.high:
+        return signal
+    ends = [end for end in (signal.low, signal.high) if math.isfinite(end)]
+    return replace(signal, usual=sum(ends) / len(ends))
 
 
 class Values:

@@ -23,6 +23,7 @@ from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.estimation.units import CONVERSIONS, in_words
 from mpcoffline.mpc import MPC
 from mpcoffline.plants import Plant
+from mpcoffline.plants.outputs import check_measured
 
 from .determined import parameters, time_constants
 from .page import Kind, LogCheck
@@ -55,7 +56,11 @@ def check_log(
 
     Returns:
         The page; ``print`` shows it.
+
+    Raises:
+        InvalidArgumentError: For a plant with outputs.
     """
+    check_measured(plant, "check")
     mpc, found = plant.mpc(), LogCheck()
     report = getattr(table, "report", None)
     found.head = str(report) if report is not None else repr(table)

@@ -14,6 +14,7 @@ from mpcoffline.datasets.table.files import hash_of
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
 from mpcoffline.plants import Plant
+from mpcoffline.plants.outputs import check_measured
 
 from .folder import Workplace, identity_of, read_run
 from .log_check import check_log
@@ -61,11 +62,13 @@ def tune(
             ``polish=True``, ``discount=0.97``.
 
     Raises:
-        InvalidArgumentError: For an option that is no number and no text, or that no learner takes.
+        InvalidArgumentError: For an option that is no number and no text, or that no learner takes; for a plant with
+            outputs.
         InvalidDataError: If the check says that nothing can be fitted before something is mended.
         StorageError: If the folder holds something else, or cannot be written.
         UnknownIdError: For an unknown preset.
     """
+    check_measured(plant, "tune")
     tell = tell or (lambda _: None)
     mpc = plant.mpc()
     options = check_options(options | {"seed": seed}, mpc)

@@ -1,0 +1,167 @@
+"""Plants of which sensors show something else than the states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from mpcoffline.core.checks import check_number
+from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.transitions import TransitionTable
+
+from .calling import called, number
+from .quantities import State, check_quantity
+
+if TYPE_CHECKING:
+    from mpcoffline.estimation import OutputIdentification
+
+    from .description import Plant
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a sensor shows.
+
+    Example:
+        >>> Output("pressure", lambda x: 0.0981 * x.level + 1.0, "bar", low=0.0, noise=0.01)
+
+    Args:
+        name: What logs call it: a Python identifier.
+        of: A function of the states ``x``; or the name of one.
+        unit: Its unit.
+        low: The least that the sensor gives.
+        high: The largest.
+        noise: Standard deviation of the simulated measurement; by default as a :class:`State` has it.
+
+    Raises:
+        InvalidArgumentError: For a name that is no identifier, or numbers that do not fit together.
+    """
+
+    name: str
+    of: str | Callable[..., Any]
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    noise: float | None = None
+
+    def __post_init__(self) -> None:
+        check_quantity("output", self)
+        of: object = self.of
+        if not isinstance(of, str) and not callable(of):
+            expected = "a function of x, or the name of a state"
+            raise InvalidArgumentError(f"output {self.name}: of", expected=expected, actual=repr(of)[:200])
+        if self.noise is not None:
+            check_number(f"output {self.name}: noise", self.noise, 0.0, open_low=False)
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation of the simulated measurement."""
+        return State(self.name, self.unit, self.low, self.high, noise=self.noise).deviation
+
+
+def checked_outputs(plant: Plant, given: object) -> tuple[Output, ...]:
+    """Outputs as they were described; the name of a state stands for that, as its sensor shows it.
+
+    Raises:
+        InvalidArgumentError: For anything else, or names that are taken.
+    """
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        expected = "a list of names of states and Output(...)"
+        raise InvalidArgumentError("outputs", expected=expected, actual=repr(given)[:200])
+    states: dict[str, State] = {state.name: state for state in plant.states}
+    found: list[Output] = []
+    for each in given:
+        output = _of_state(states[each]) if isinstance(each, str) and each in states else each
+        if not isinstance(output, Output):
+            raise _unknown("outputs", str(output), states)
+        if isinstance(output.of, str) and output.of not in states:
+            raise _unknown(f"output {output.name}: of", output.of, states)
+        found.append(output)
+    names = [q.name for q in found]
+    taken = names + plant.names("inputs") + plant.names("signals")
+    taken += [name for name in states if not any(q.name == q.of == name for q in found)]
+    if twice := sorted({name for name in names if taken.count(name) > 1}):
+        raise InvalidArgumentError("outputs", expected="names of their own", actual=f"{twice[0]!r} twice")
+    return tuple(found)
+
+
+def _of_state(state: State) -> Output:
+    return Output(state.name, state.name, state.unit, state.low, state.high, state.deviation)
+
+
+def _unknown(what: str, given: str, states: Mapping[str, State]) -> InvalidArgumentError:
+    error = UnknownIdError.of(what, given, list(states))
+    return InvalidArgumentError(what, expected=error.expected, actual=error.actual, hint=error.hint)
+
+
+def outputs_function(plant: Plant) -> ca.Function:
+    """What sensors show of the states ``(nx, 1)``, without noise, as a column."""
+    x = ca.SX.sym("x", len(plant.states))
+    values, names = ca.vertsplit(x), plant.names("states")
+    rows = []
+    for output in plant.outputs:
+        of = output.of
+        if isinstance(of, str):
+            rows.append(values[names.index(of)])
+        else:
+            what = f"output {output.name}"
+            rows.append(number(what, called(what, of, plant.values(values))))
+    return ca.Function("outputs", [x], [ca.densify(ca.vertcat(*rows))])
+
+
+def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentification:
+    """See :meth:`mpcoffline.Plant.identify`."""
+    from mpcoffline.estimation import identify_from_outputs  # a second, which reading a log need not wait for
+
+    if not plant.outputs:
+        hint = "Where the states themselves are measured, a learner takes the log as it is."
+        raise InvalidArgumentError("outputs", expected="a plant with outputs", actual="none", hint=hint)
+    function = outputs_function(plant)
+    low, high = np.array([state.starts for state in plant.states]).T
+    spread = (high - low) / np.sqrt(12.0)
+    for i in np.flatnonzero(spread == 0.0).tolist():
+        own = [k for k, output in enumerate(plant.outputs) if output.of == plant.states[i].name]
+        if not own:
+            expected = "a range (low, high): how far it may be from there when an episode begins, as nobody measures it"
+            name = f"state {plant.states[i].name}: start"
+            raise InvalidArgumentError(name, expected=expected, actual=repr(plant.states[i].start))
+        spread[i] = np.std(log.values().observations[:, own[0]])
+    found = identify_from_outputs(plant.mpc(), log, function, start=0.5 * (low + high), start_spread=spread, seed=seed)
+    return replace(found, table=_with_costs(plant, found, log.names[len(plant.outputs) :]))
+
+
+def _with_costs(plant: Plant, found: OutputIdentification, names: tuple[str, ...]) -> TransitionTable:
+    """Transitions with what the plant's cost says of their states, as the log of outputs could not tell it."""
+    columns, layout, n = found.table.values(), found.mpc.layout, len(plant.states)
+    first = np.zeros(len(found.table), dtype=bool)
+    first[found.table.episodes.firsts] = True
+    inputs: Array = columns.actions
+    before = np.where(first[:, None], inputs, np.roll(inputs, 1, axis=0))
+    states, present = columns.observations[:, :n], columns.observations[:, layout.present.tolist()]
+    costs = plant.costs(states, inputs, present, before)
+    table = TransitionTable.from_arrays(
+        columns.observations, inputs, costs, columns.next_observations, columns.terminations, found.table.episode_ids
+    )
+    if names:
+        own = (f"{state.name} [{state.unit}]" if state.unit else state.name for state in plant.states)
+        table.names = (*own, *names)
+    return table
+
+
+def check_measured(plant: Plant, what: str) -> None:
+    """Refuses a plant of which the states are not measured, where they have to be.
+
+    Raises:
+        InvalidArgumentError: For one with outputs; says what can be done.
+    """
+    if plant.outputs:
+        hint = "In Python: learner.fit(plant.identify(plant.read(log))), then learner.output_policy."
+        actual = f"outputs {', '.join(output.name for output in plant.outputs)}"
+        expected = f"states that are measured, for {what}"
+        raise InvalidArgumentError(plant.name, expected=expected, actual=actual, hint=hint)
