@@ -32,11 +32,13 @@ _log = logging.getLogger(__name__)
 _ROWS = 2_000  # that parameters are searched on
 _LONGEST = 100  # steps of a stretch there
 _STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 40
-_NEWTON, _SHORTER = 8, 2.0 ** -np.arange(8)  # iterations at the end; what of a step is tried
+_NEWTON, _EVALUATIONS = 8, 5_000  # iterations at the end, as far as so many evaluations suffice
+_SHORTER = 2.0 ** -np.arange(8)  # what of a step is tried
 _FLAT, _DONE = 1e-9, 1e-3  # of the largest curvature; by how much the logarithm falls at the end
 _AWAY = 0.7  # standard deviation of the starts, in logarithms or scaled coordinates
 _PROCESS = 0.01  # of the spread of starts: what the model is first taken to miss in a step
 _WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of the priors
+_FARTHEST = 10.0  # logarithms of noise from where it begins: beyond, numbers end
 _STEP = 1e-4  # of differences
 _UNKNOWN = 0.5  # of the prior's standard deviation: what is left so wide was not told by the log
 _SEEN = 0.5  # share of a state's variance that outputs have to remove
@@ -156,7 +158,7 @@ class _Search:
         parts = {"parameters": self.coordinates.size, "noise": len(noise), "process": len(spread), "start": len(spread)}
         self._widths = np.concatenate([np.full(n, _WIDTHS[name]) for name, n in parts.items()])
         self._ends = np.cumsum(list(parts.values()))[:-1]
-        free = np.full(sum(list(parts.values())[1:]), np.inf)
+        free = np.repeat([_FARTHEST, np.inf], [len(noise) + len(spread), len(spread)])
         self._bounds = scipy.optimize.Bounds(
             np.append(self.coordinates.low, -free), np.append(self.coordinates.high, free)
         )
@@ -198,7 +200,7 @@ class _Search:
         Curvatures count by their size, steps are as short as they must be.
         """
         value = float(self.loss(v[None])[0])
-        for _ in range(_NEWTON):
+        for _ in range(min(_NEWTON, 1 + _EVALUATIONS // (2 * len(v) ** 2))):
             steps = _STEP * np.eye(len(v))
             ahead, behind = np.split(self.loss(np.vstack([v + steps, v - steps])), 2)
             curvatures, axes = np.linalg.eigh(self.curvature(v))

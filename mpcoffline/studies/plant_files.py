@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidDataError, MPCOfflineError, StorageError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets import load_dataset
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 _MUST_HAVE = ("DT", "STEPS", "DISCOUNT", "N_EPISODES", "Plant", "behaviour", "mpc", "truth")
@@ -34,7 +35,9 @@ class PlantFile:
     Attributes:
         name: Name of the plant: its file's, without ``.py``.
         module: What the file defines: ``DT``, ``STEPS``, ``DISCOUNT``, ``N_EPISODES``, ``Plant``, ``behaviour``,
-            ``mpc``, ``truth``, perhaps ``LEARN``; its ``Plant`` perhaps ``violations``.
+            ``mpc``, ``truth``, perhaps ``LEARN``, ``DATASET`` (the id of one, of which some episodes are the log) and
+            ``OUTPUTS`` (places of the states that are measured where some are hidden); its ``Plant`` perhaps
+            ``violations``.
     """
 
     name: str
@@ -77,7 +80,12 @@ class PlantFile:
         return cls(path.stem, module)
 
     def log(self, seed: int) -> TransitionTable:
-        """The log that the plant's own controllers make, another controller each episode."""
+        """The log that the plant's own controllers make, another controller each episode; or some of its data set."""
+        if (dataset := getattr(self.module, "DATASET", None)) is not None:
+            table = TransitionTable.of(load_dataset(dataset))
+            rng, (_, firsts, lengths) = np.random.default_rng([_LOG, seed]), table.episodes
+            some = rng.permutation(len(firsts))[: self.module.N_EPISODES]
+            return table.take(np.concatenate([np.arange(firsts[e], firsts[e] + lengths[e]) for e in np.sort(some)]))
         rngs = [np.random.default_rng([_LOG, seed, episode]) for episode in range(self.module.N_EPISODES)]
         return self._recorded(rngs, self.module.behaviour)
 

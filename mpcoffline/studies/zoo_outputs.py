@@ -123,7 +123,7 @@ def _fill(found: Found, case: Case, tell: Callable[[str], None]) -> None:
     log, seed, nominal = plant.log(case.seed), case.seed, plant.module.mpc(case.seed)
     n = nominal.layout.n_states
     states = log.values().observations[:, :n]
-    places = shown_states(nominal, log)
+    places = list(getattr(plant.module, "OUTPUTS", None) or shown_states(nominal, log))
     found["shown"] = f"{', '.join(str(nominal.layout.y_labels[i]) for i in places)} of {n}"
     noise = NOISE * states[:, places].std(axis=0)
     first = states[log.episodes.firsts]
