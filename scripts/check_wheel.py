@@ -2,7 +2,7 @@
 
 FOLDER/dist holds wheel and sdist. PYTHON is that of an environment with the dependencies; without it a new one is made
 that borrows those of the environment which runs this script by a path file, so that nothing is downloaded; the editable
-install there does not reach it, as path files do not nest.
+install there does not reach it, as path files do not nest. With PYTHON only what its versions decide is tried.
 
 Tried are: the contents of the sdist, the metadata as an index sees it, the import, the command line, the README's quick
 start (with a short regression), and scripts/users_script.py, which is run, and type-checked together with the quick
@@ -57,13 +57,14 @@ runpy.run_path(sys.argv[1], run_name="__main__")
 
 def main(scratch: Path, python: Path | None) -> None:
     wheel, sdist = (next((scratch / "dist").glob(pattern)) for pattern in ("*.whl", "*.tar.gz"))
-    check_sdist(sdist)
-    step("twine", [sys.executable, "-m", "twine", "check", "--strict", wheel, sdist])
+    whole = python is None
     if python is None:
+        check_sdist(sdist)
+        step("twine", [sys.executable, "-m", "twine", "check", "--strict", wheel, sdist])
         python = borrowing_environment(scratch / "venv")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python]
     step("installation", [*pip, "install", "-q", "--no-deps", "--force-reinstall", wheel])
-    try_wheel(python, scratch / "trial")
+    try_wheel(python, scratch / "trial", types=whole)
     print(f"{wheel.name} ({wheel.stat().st_size / 1e6:.1f} MB), {sdist.name} ({sdist.stat().st_size / 1e6:.1f} MB)")
 
 
@@ -94,8 +95,8 @@ def packages_of(python: Path) -> Path:
     return Path(subprocess.run(where, check=True, capture_output=True, text=True).stdout.strip())
 
 
-def try_wheel(python: Path, folder: Path) -> None:
-    """All trials, in a new folder that is the user's home and store of data sets."""
+def try_wheel(python: Path, folder: Path, *, types: bool) -> None:
+    """All trials, perhaps that of the types, in a new folder that is the user's home and store of data sets."""
     (folder / "minari").mkdir(parents=True)
     environment = {"PATH": os.environ["PATH"], "HOME": str(folder), "MINARI_DATASETS_PATH": str(folder / "minari")}
     environment |= {"OMP_NUM_THREADS": "1", "COLUMNS": "100"}
@@ -108,14 +109,15 @@ def try_wheel(python: Path, folder: Path) -> None:
     # Without the project's configuration: what is checked is what a stranger's mypy sees, through py.typed.
     mypy = [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--python-executable", python]
     background = ThreadPoolExecutor(1)
-    types = background.submit(trial, "user's types", *mypy, "quick_start.py", "users_script.py")
+    checked = background.submit(trial, "user's types", *mypy, "quick_start.py", "users_script.py") if types else None
     trial("import", python, "-W", "error::DeprecationWarning", "-c", "import mpcoffline")
     trial("wheel", python, "-c", TRIAL, packages_of(python).parents[2])
     for arguments in (["--version"], ["run", "--help"], ["datasets", "list"]):
         trial(f"mpcoffline {' '.join(arguments)}", python.parent / "mpcoffline", *arguments)
     trial("quick start", python, "-c", RUN, "quick_start.py")
     trial("user's script", python, "-c", RUN, "users_script.py")
-    types.result()
+    if checked is not None:
+        checked.result()
 
 
 def quick_start() -> str:

@@ -77,7 +77,7 @@ def problem(name: str) -> tuple[MPC, TransitionTable]:
         return spring_mpc(), spring_log(n=25, length=20)
     options = {} if name == "linear" else {"alpha": 1.0, "seed": 0}
     table = TransitionTable.of(load_dataset(f"mpcoffline/{name}/ddpg-v0"))
-    return nominal_mpc(f"mpcoffline/{TASKS[name]}", **options), table.take(slice(0, 1_500))
+    return nominal_mpc(f"mpcoffline/{TASKS[name]}", **options), table.take(slice(0, 1_000))
 
 
 def learned(units: Units, mpc: MPC, table: TransitionTable, preset: str, **options: Any) -> Learned:
