@@ -21,6 +21,7 @@ from .output_episodes import (
     OutputEpisodes,
     OutputPoint,
     filtered_outputs,
+    missed_ahead,
     output_episodes,
     smoothed_states,
     with_states,
@@ -41,6 +42,9 @@ _WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of 
 _FARTHEST = 10.0  # logarithms of noise from where it begins: beyond, numbers end
 _STEP = 1e-4  # of differences
 _UNKNOWN = 0.5  # of the prior's standard deviation: what is left so wide was not told by the log
+_AHEAD = 15  # steps, as models of the log are judged by
+_NOTHING = 0.7  # of what outputs move, missed: such a model says little more than that they stay
+_SAYS_NOTHING = "That is hardly better than to say that they stay: is the model's structure right, or an input unknown?"
 _SEEN = 0.5  # share of a state's variance that outputs have to remove
 
 
@@ -55,6 +59,8 @@ class OutputIdentification:
         names: Names of the parameters that were learned, ``(p,)``.
         deviations: Their standard deviations, in logarithms for those above zero, ``(p,)``.
         seen: Share of each state's variance that outputs remove, of what there would be without them, ``(n_states,)``.
+        missed: How far each output is from what was predicted 15 steps before, in what it moves in these,
+            ``(n_outputs,)``; NaN where no episode is that long.
         table: The log with smoothed states in place of outputs: what a learner takes.
     """
 
@@ -63,11 +69,15 @@ class OutputIdentification:
     names: tuple[str, ...]
     deviations: Array
     seen: Array
+    missed: Array
     table: TransitionTable
 
     def __str__(self) -> str:
         """What was found, in sentences."""
-        return f"{self.sensors} Their model misses {listed(self.sensors.process)} a step."
+        said = f"{self.sensors} Their model misses {listed(self.sensors.process)} a step."
+        if np.isfinite(self.missed).all():
+            said += f" {_AHEAD} steps ahead, outputs are missed by {listed(100.0 * self.missed)} % of what they move."
+        return f"{said} {_SAYS_NOTHING}" if (self.missed > _NOTHING).any() else said
 
 
 def identify_from_outputs(
@@ -126,8 +136,9 @@ def identify_from_outputs(
     sensors = Sensors(model.function, *parts, undetermined=tuple(unknown))
     deviations = wide * np.where(search.coordinates.logarithmic, 1.0, search.coordinates.scale)
     table = with_states(log, states, data, model.n_outputs)
-    result = OutputIdentification(identified, sensors, names, deviations, seen, table)
-    (_log.warning if unknown else _log.info)("%s", result)
+    missed = missed_ahead(model, data, found, given.start_spread, _AHEAD)
+    result = OutputIdentification(identified, sensors, names, deviations, seen, missed, table)
+    (_log.warning if unknown or (missed > _NOTHING).any() else _log.info)("%s", result)
     return result
 
 

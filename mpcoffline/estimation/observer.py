@@ -80,6 +80,10 @@ class OutputModel:
             x[failed], F[failed] = known.x[failed], self._identity
         return Estimate(x, F @ known.P @ F.swapaxes(1, 2) + Q), F
 
+    def seen(self, x: Array) -> Array:
+        """Outputs without noise of states ``(B, n)``, ``(B, n_outputs)``."""
+        return _called(self._seen, x)[0]
+
     def corrected(self, known: Estimate, y: Array, R: Array) -> tuple[Estimate, Array, Array]:
         """What is known with outputs y ``(B, n_outputs)``, the innovations, and their covariance S.
 

@@ -174,6 +174,30 @@ def smoothed_states(
     return states, 1.0 - np.clip(np.nan_to_num(share), 0.0, 1.0)
 
 
+def missed_ahead(model: OutputModel, data: OutputEpisodes, found: OutputPoint, spread: Array, steps: int) -> Array:
+    """How far outputs are from what the model says of them some steps before, in what they move in these steps.
+
+    Predicted is from the filter's estimates, every so many steps, with the inputs that followed: ``(n_outputs,)``, the
+    roots of mean squares; about 1 for a model that knows no more than that they stay, NaN where nothing is that long.
+    """
+    n = data.y.shape[2]
+    missed, moved, count = np.zeros(n), np.zeros(n), np.zeros(n)
+    for part in _parts(data):
+        history = filtered_outputs(model, part, found, spread)[0]
+        for first in range(0, len(part.acting) - steps + 1, steps):
+            known = history[first]
+            for k in range(first, first + steps):
+                known = model.ahead(known, part.acting[k], found.theta, np.zeros_like(known.P[0]))[0]
+            last = part.y[first + steps]
+            off, change = last - model.seen(known.x), last - part.y[first]
+            both = np.isfinite(off) & np.isfinite(change)
+            missed += np.where(both, off**2, 0.0).sum(axis=0)
+            moved += np.where(both, change**2, 0.0).sum(axis=0)
+            count += both.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(count > 0, np.sqrt(missed / moved), np.nan))
+
+
 def _ridge(P: Array) -> Array:
     """What keeps a covariance of an exact model regular."""
     return np.asarray(1e-12 * np.einsum("bii->b", P)[:, None, None] * np.eye(P.shape[-1]))

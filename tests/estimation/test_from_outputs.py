@@ -166,6 +166,9 @@ def test_model_noise_and_speeds_are_found_from_angles(delay: int | None, from_an
     assert np.sqrt(np.mean(missed**2, axis=(0, 1)))[0] < 0.5 * NOISE
     assert np.sqrt(np.mean(missed**2, axis=(0, 1)))[1] < 0.03
     assert "1 output with a noise of 0.0" in str(found)
+    assert found.missed[0] < 0.25
+    assert "15 steps ahead, outputs are missed by " in str(found)
+    assert "hardly better" not in str(found)
 
 
 def test_signals_stay_in_the_table() -> None:
@@ -199,6 +202,20 @@ def test_what_outputs_do_not_show_is_named(caplog: pytest.LogCaptureFixture) -> 
     assert (found.seen[:2] > 0.9).all()
     assert found.seen[2] < 0.5
     assert "hardly says anything of model.rate, observation 2 (a state)" in caplog.text
+
+
+def test_a_model_that_predicts_nothing_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    """Angles under another input than is logged."""
+    log, _ = log_of(mpc_of(), n=20, steps=40)
+    columns, rng = log.values(), np.random.default_rng(0)
+    other = rng.uniform(-3.0, 3.0, columns.actions.shape)
+    parts = columns.observations, other, columns.costs, columns.next_observations, columns.terminations
+    with caplog.at_level(logging.WARNING):
+        found = identify_from_outputs(
+            mpc_of(), TransitionTable.from_arrays(*parts, log.episode_ids), [0], start_spread=[0.5, 0.5]
+        )
+    assert found.missed[0] > 0.75
+    assert "hardly better than to say that they stay" in caplog.text
 
 
 def test_the_same_seed_gives_the_same_numbers() -> None:
