@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mpcoffline.control.export import export_c
+from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.outputs import write_file
@@ -21,6 +22,7 @@ from mpcoffline.diagnostics import diagnose
 from mpcoffline.diagnostics.page import Section
 from mpcoffline.diagnostics.report import Report
 from mpcoffline.diagnostics.trial import stretched
+from mpcoffline.estimation import OutputIdentification
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST
@@ -43,7 +45,7 @@ class Order:
         plant: Name of the plant.
         reader: What reads its logs, as JSON.
         mpc: MPC_1.
-        table: All transitions that are learned from.
+        table: All transitions that are learned from, of states.
         options: Of the learner: ``preset``, ``learn``, ``polish``, ``seed``.
         also: Further controllers that are tried beside what is learned, by name.
         sections: Further parts of the page.
@@ -52,6 +54,7 @@ class Order:
         start: What was learned before, where identification begins, too.
         widened: How many times as wide as models alone say the band of the proposal's cost is, since trials lay outside
             theirs.
+        outputs: Where the log holds outputs, what was found in them; the table is its.
     """
 
     plant: str
@@ -65,6 +68,7 @@ class Order:
     doubt: str = ""
     start: MPC | None = None
     widened: float = 1.0
+    outputs: OutputIdentification | None = None
 
 
 def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> dict[str, Any]:
@@ -104,6 +108,10 @@ def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> 
     def written() -> dict[str, Any]:
         kept = judgement["verdict"] == KEEP
         policy = MPCPolicy(order.mpc) if kept else learner.policy
+        if learner.sensors is not None:
+            observer = learner.sensors.suited(policy.mpc, order.table).observer(policy.mpc)
+            OutputFeedbackPolicy(policy, observer).save(path / POLICY)
+            return {"controller": None, "why_no_controller": "exported code has no observer, yet."}
         policy.save(path / POLICY)
         tell("Writing the controller as C99")
         try:
@@ -146,7 +154,8 @@ def _learner(order: Order, path: Path, tell: Tell, show_progress: bool) -> Offli
     checkpoint = path / CHECKPOINT
     tell("Fitting" + (", from where it was interrupted" if checkpoint.is_file() else ""))
     learner = OfflineMPCLearner(order.mpc, **order.options)
-    learner.fit(order.table, checkpoint=checkpoint, show_progress=show_progress, also=order.also, start=order.start)
+    data = order.table if order.outputs is None else order.outputs
+    learner.fit(data, checkpoint=checkpoint, show_progress=show_progress, also=order.also, start=order.start)
     learner.save(file)
     return learner
 

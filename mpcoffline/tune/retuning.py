@@ -9,6 +9,7 @@ from typing import Any
 
 from mpcoffline.core.archive import file_errors
 from mpcoffline.core.documents import read_json
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.logs.collecting import Options
 from mpcoffline.datasets.logs.reading import LoggedTable, read_log
 from mpcoffline.datasets.logs.sources import opened
@@ -77,6 +78,7 @@ def retune(
 
     Raises:
         FileFormatError: If the folder is none of ``tune``, or damaged.
+        InvalidArgumentError: For a plant whose outputs are measured in place of its states.
         InvalidDataError: If the trial cannot be understood, or contradicts the description.
     """
     tell = tell or (lambda _: None)
@@ -123,7 +125,13 @@ def _reader(before: Tuned) -> tuple[Wanted, str]:
     path = before.folder / PLANT
     with file_errors(path):
         data = _reader_json(before)
-        return Wanted.from_json(data), str(data["name"])
+        name = str(data["name"])
+        reader = None if "outputs" in data else Wanted.from_json(data)
+    if reader is None:
+        hint = "Tune anew with all logs: mpcoffline tune PLANT.py LOG TRIAL --out FOLDER."
+        actual = "outputs in place of these"
+        raise InvalidArgumentError(name, expected="states that are measured", actual=actual, hint=hint)
+    return reader, name
 
 
 def _options(before: Tuned, trial: Any, read: Mapping[str, Any] | None) -> Options:

@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
+from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.archive import file_errors
 from mpcoffline.core.errors import FileFormatError
@@ -69,6 +70,11 @@ class Tuned:
     def policy(self) -> MPCPolicy:
         """What ``policy.zip`` holds: the proposal, or MPC_1 where the verdict is to keep that."""
         return MPCPolicy.load(self.folder / POLICY)
+
+    @property
+    def output_policy(self) -> OutputFeedbackPolicy:
+        """The same where the plant's outputs are measured in place of its states."""
+        return OutputFeedbackPolicy.load(self.folder / POLICY)
 
     @property
     def learner(self) -> OfflineMPCLearner:

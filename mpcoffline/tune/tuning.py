@@ -13,8 +13,8 @@ from mpcoffline.datasets.logs.reading import LoggedTable
 from mpcoffline.datasets.table.files import hash_of
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
+from mpcoffline.mpc.expressions import function_to_json
 from mpcoffline.plants import Plant
-from mpcoffline.plants.outputs import check_measured
 
 from .folder import Workplace, identity_of, read_run
 from .log_check import check_log
@@ -45,6 +45,9 @@ def tune(
     * ``log.zip`` and ``plant.json``, from which ``retune`` goes on without running the plant file again;
     * ``run.json``, options, versions, hashes, verdict and expected costs.
 
+    Of a plant with outputs, model and states are found in these first (:meth:`mpcoffline.Plant.identify`), in place of
+    the check; the policy has its observer, there is no C code, and ``retune`` does not know such folders, yet.
+
     Example:
         >>> plant = mpcoffline.load_plant("two_tank.py")
         >>> tuned = tune(plant, plant.read("log.csv"), "tuned")
@@ -62,17 +65,15 @@ def tune(
             ``polish=True``, ``discount=0.97``.
 
     Raises:
-        InvalidArgumentError: For an option that is no number and no text, or that no learner takes; for a plant with
-            outputs.
+        InvalidArgumentError: For an option that is no number and no text, or that no learner takes.
         InvalidDataError: If the check says that nothing can be fitted before something is mended.
         StorageError: If the folder holds something else, or cannot be written.
         UnknownIdError: For an unknown preset.
     """
-    check_measured(plant, "tune")
     tell = tell or (lambda _: None)
     mpc = plant.mpc()
     options = check_options(options | {"seed": seed}, mpc)
-    reader = {"name": plant.name} | plant.wanted.to_json(plant.cost_function)
+    reader = _reader(plant)
     identity = identity_of(reader=reader, mpc=mpc.to_json(), log=hash_of(table), options=options)
     place = Workplace(Path(out), identity)
     if place.finished is not None:
@@ -94,14 +95,38 @@ def tune(
             )
         return _said(found)
 
-    said = place.once("check", checked)
+    def estimated() -> dict[str, Any]:
+        return {"verdict": f"The log holds outputs. {outputs}", "remarks": []}
+
+    outputs = None
+    if plant.outputs:
+        tell("Finding model and states in the outputs")
+        outputs = plant.identify(table, seed=options["seed"])
+        tell(f"  {outputs}")
+    said = place.once("check", estimated if plant.outputs else checked)
     for each in said["remarks"]:
         if each["kind"] == "problem":
             tell(f"To be looked at: {each['about']}: {each['text']}")
-    order = Order(plant.name, reader, mpc, table, options, sections=[_section(table, said)])
+    order = Order(
+        plant.name,
+        reader,
+        mpc,
+        table if outputs is None else outputs.table,
+        options,
+        sections=[_section(table, said)],
+        outputs=outputs,
+    )
     document = made(order, place, tell, show_progress=show_progress) | {"check": said, **_read_as(table)}
     former = place.finish(document)
     return Tuned(place.folder, read_run(place.folder), former=former)
+
+
+def _reader(plant: Plant) -> dict[str, Any]:
+    """What reads logs of a plant, and what tells it from another."""
+    if not plant.outputs:
+        return {"name": plant.name} | plant.wanted.to_json(plant.cost_function)
+    shown = {"outputs": function_to_json(plant.outputs_function), "cost": function_to_json(plant.cost_function)}
+    return {"name": plant.name, "dt": float(plant.dt), **shown}
 
 
 def _said(found: LogCheck) -> dict[str, Any]:
