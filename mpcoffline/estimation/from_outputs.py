@@ -10,6 +10,7 @@ import scipy.optimize
 import torch
 from numpy.typing import ArrayLike
 
+from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
@@ -32,6 +33,7 @@ _log = logging.getLogger(__name__)
 
 _ROWS = 2_000  # that parameters are searched on
 _LONGEST = 100  # steps of a stretch there
+_ROWS_A_NUMBER = 3  # that are the least to learn it from
 _STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 40
 _NEWTON, _EVALUATIONS = 8, 5_000  # iterations at the end, as far as so many evaluations suffice
 _SHORTER = 2.0 ** -np.arange(8)  # what of a step is tried
@@ -116,12 +118,15 @@ def identify_from_outputs(
 
     Raises:
         InvalidArgumentError: For outputs of another number than the log's, or what :class:`KalmanObserver` refuses.
-        InvalidDataError: If an output never moves, or episodes are too short to see a state in them.
+        InvalidDataError: If an output never moves, rows are few, or episodes too short to see a state in them.
     """
     model = OutputModel(mpc, outputs)
     given = KalmanObserver(mpc, outputs, 1.0, 0.0, start=start, start_spread=start_spread)
     data = output_episodes(mpc, log, model.n_outputs)
     search = _Search(mpc, model, data.some(_ROWS, _LONGEST, seed), _first_start(given, data), given.start_spread, log)
+    if len(log) < _ROWS_A_NUMBER * search.size:
+        expected = f"{_ROWS_A_NUMBER * search.size} rows at least, to find {search.size} numbers in"
+        raise InvalidDataError("log", expected=expected, actual=str(len(log)))
     v = search.best(seed)
     found, curvature = search.found(v), search.curvature(v)
     p = search.coordinates.size
@@ -173,6 +178,11 @@ class _Search:
         self._bounds = scipy.optimize.Bounds(
             np.append(self.coordinates.low, -free), np.append(self.coordinates.high, free)
         )
+
+    @property
+    def size(self) -> int:
+        """How many coordinates there are."""
+        return len(self._widths)
 
     def found(self, v: Array) -> OutputPoint:
         """What a point ``(..., size)`` is in units."""

@@ -161,7 +161,7 @@ def check_measured(plant: Plant, what: str) -> None:
         InvalidArgumentError: For one with outputs; says what can be done.
     """
     if plant.outputs:
-        hint = "In Python: learner.fit(plant.identify(plant.read(log))), then learner.output_policy."
+        hint = "`mpcoffline tune` estimates these; in Python: learner.fit(plant.identify(plant.read(log)))."
         actual = f"outputs {', '.join(output.name for output in plant.outputs)}"
         expected = f"states that are measured, for {what}"
         raise InvalidArgumentError(plant.name, expected=expected, actual=actual, hint=hint)

@@ -232,6 +232,8 @@ def test_logs_that_cannot_be_are_named() -> None:
     short, _ = log_of(mpc_of(), n=3, steps=1)
     with pytest.raises(InvalidDataError, match="episodes of 2 steps at least"):
         identify_from_outputs(mpc_of(), short, [0], start_spread=1.0)
+    with pytest.raises(InvalidDataError, match="24 rows at least, to find 8 numbers in, got 12"):
+        identify_from_outputs(mpc_of(), log, [0], start_spread=1.0)
     columns = log.values()
     still = np.zeros_like(columns.observations)
     table = TransitionTable.from_arrays(
