@@ -19,7 +19,6 @@ from mpcoffline.estimation.plant import settled
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
-from mpcoffline.learning.ends import innermost
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.behaviour import Agreement, Behaviour, agreement
@@ -114,9 +113,8 @@ def diagnose(
     logged = TransitionTable.of(dataset)
     table = with_memory(logged, learned.layout)
     known = None if learner.result is None else learner.result.cost
-    # From the rows that the fit learns from: far out a plant may do what no parameters explain (a stop, an impact).
-    near = innermost(table, learner.method.trim, learned.discount, learned.layout.n_states)
-    found, clean = identify_as_logged(nominal, table, as_logged(learned, near, known), seed=seed, start=learner.start)
+    # From all rows, also those far out that a fit leaves aside: controllers go there, too.
+    found, clean = identify_as_logged(nominal, table, as_logged(learned, table, known), seed=seed, start=learner.start)
     identified = nominal.replace(model=found.model)
     around = surroundings_of(
         learned,
