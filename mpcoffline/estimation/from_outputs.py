@@ -35,7 +35,7 @@ _ROWS = 2_000  # that parameters are searched on
 _LONGEST = 100  # steps of a stretch there
 _ROWS_A_NUMBER = 3  # that are the least to learn it from
 _STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 40
-_NEWTON, _EVALUATIONS = 8, 5_000  # iterations at the end, as far as so many evaluations suffice
+_EVALUATIONS = 2_500  # of Newton's method at the end
 _SHORTER = 2.0 ** -np.arange(8)  # what of a step is tried
 _FLAT, _DONE = 1e-9, 1e-3  # of the largest curvature; by how much the logarithm falls at the end
 _AWAY = 0.7  # standard deviation of the starts, in logarithms or scaled coordinates
@@ -218,23 +218,28 @@ class _Search:
     def _settled(self, v: Array) -> Array:
         """The minimum near v by Newton's method: along narrow valleys, where parameters are told apart by little.
 
-        Curvatures count by their size, steps are as short as they must be.
+        Curvatures count by their size, and are found again where a step had to be shortened.
         """
-        value = float(self.loss(v[None])[0])
-        for _ in range(min(_NEWTON, 1 + _EVALUATIONS // (2 * len(v) ** 2))):
-            steps = _STEP * np.eye(len(v))
+        value, n = float(self.loss(v[None])[0]), len(v)
+        steps, left, curved = _STEP * np.eye(n), float(_EVALUATIONS), None
+        while left > 0.0:
+            fresh = curved is None
+            if curved is None:
+                curvatures, axes = np.linalg.eigh(self.curvature(v))
+                curved, left = (np.maximum(np.abs(curvatures), _FLAT * np.abs(curvatures).max()), axes), left - 2 * n**2
+            sizes, axes = curved
             ahead, behind = np.split(self.loss(np.vstack([v + steps, v - steps])), 2)
-            curvatures, axes = np.linalg.eigh(self.curvature(v))
-            sizes = np.maximum(np.abs(curvatures), _FLAT * np.abs(curvatures).max())
             step = -axes @ (axes.T @ (ahead - behind) / (2.0 * _STEP) / sizes)
             points = np.clip(v + _SHORTER[:, None] * step, self._bounds.lb, self._bounds.ub)
-            losses = self.loss(points)
+            losses, left = self.loss(points), left - 2 * n - len(points)
             best = int(np.argmin(losses))
-            if not losses[best] < value:
-                break
-            v, fallen, value = points[best], value - float(losses[best]), float(losses[best])
-            if fallen < _DONE:
-                break
+            fallen = value - float(losses[best])
+            if fallen > 0.0:
+                v, value = points[best], float(losses[best])
+            if best > 0 or not fallen > _DONE:
+                if fresh and not fallen > _DONE:
+                    break
+                curved = None
         return v
 
     def _descended(self, v: Array, iterations: int) -> tuple[Array, float]:

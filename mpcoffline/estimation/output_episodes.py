@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -14,6 +15,8 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
 from .observer import Estimate, OutputModel
+
+_log = logging.getLogger(__name__)
 
 _CHUNK = 200  # episodes smoothed at a time
 
@@ -212,18 +215,31 @@ def _parts(data: OutputEpisodes) -> Iterator[OutputEpisodes]:
 
 
 def with_states(log: TransitionTable, states: list[Array], data: OutputEpisodes, n_outputs: int) -> TransitionTable:
-    """The log with states in place of outputs."""
+    """The log with states in place of outputs; without episodes that the model cannot follow, as they run away in it.
+
+    Raises:
+        InvalidDataError: If it can follow none.
+    """
     columns, n = log.values(), states[0].shape[1]
     s, after = np.empty((len(log), n)), np.empty((len(log), n))
     for first, length, x in zip(data.rows, data.lengths, states, strict=True):
         s[first : first + length], after[first : first + length] = x[:-1], x[1:]
     signals, later = (part[:, n_outputs:] for part in (columns.observations, columns.next_observations))
+    lost = [not np.isfinite(x).all() for x in states]
+    if all(lost):
+        hint = "Is its structure right, and does start_spread say where episodes begin?"
+        raise InvalidDataError("log", expected="an episode that the model can follow", actual="none", hint=hint)
+    if any(lost):
+        _log.warning("%d of %d episodes are left out: in the model they run away", sum(lost), len(lost))
+    followed = np.repeat(~np.array(lost), data.lengths)
+    kept = np.concatenate([np.arange(first, first + n) for first, n in zip(data.rows, data.lengths, strict=True)])
+    kept = np.sort(kept[followed])
     return TransitionTable.from_arrays(
-        np.hstack([s, signals]),
-        columns.actions,
-        columns.costs,
-        np.hstack([after, later]),
-        columns.terminations,
-        log.episode_ids,
+        np.hstack([s, signals])[kept],
+        columns.actions[kept],
+        columns.costs[kept],
+        np.hstack([after, later])[kept],
+        columns.terminations[kept],
+        log.episode_ids[kept],
         name=log.name,
     )

@@ -22,6 +22,7 @@ from mpcoffline.estimation.output_episodes import (
     filtered_outputs,
     output_episodes,
     smoothed_states,
+    with_states,
 )
 from mpcoffline.mpc import Model, Parameter, QuadraticCost, Signal
 
@@ -280,3 +281,17 @@ def test_what_is_learned_from_angles_acts_on_angles_nearly_as_well_as_the_true_m
     again, y = OfflineMPCLearner.load(tmp_path / "learner.zip"), np.array([0.3])
     np.testing.assert_array_equal(again.output_policy.predict(y)[0], learner.output_policy.predict(y)[0])
     assert str(again.sensors) == str(learner.sensors)
+
+
+def test_episodes_that_run_away_in_the_model_are_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    log, _ = log_of(mpc_of(), n=3, steps=4)
+    data = output_episodes(mpc_of(), log, 1)
+    states = [np.full((5, 2), float(k)) for k in range(3)]
+    states[1][2:] = np.nan
+    with caplog.at_level(logging.WARNING):
+        table = with_states(log, states, data, 1)
+    assert "1 of 3 episodes are left out" in caplog.text
+    np.testing.assert_array_equal(table.values().observations[:, 0], [0.0] * 4 + [2.0] * 4)
+    np.testing.assert_array_equal(table.episode_ids, [0] * 4 + [2] * 4)
+    with pytest.raises(InvalidDataError, match="an episode that the model can follow"):
+        with_states(log, [np.full((5, 2), np.nan)] * 3, data, 1)
