@@ -187,11 +187,11 @@ class KalmanObserver:
             acting: The inputs that act in it, dead time past, and the present signals, as ``mpc.layout.split`` gives
                 them, ``(B, nu + n_signals)``.
         """
-        return self._model.ahead(known, acting, self._theta, self._Q)[0]
+        return _finite(self._model.ahead(known, acting, self._theta, self._Q)[0], known)
 
     def corrected(self, known: Estimate, y: Array) -> Estimate:
         """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there."""
-        return self._model.corrected(known, y, self._R)[0]
+        return _finite(self._model.corrected(known, y, self._R)[0], known)
 
     def states(self, known: Estimate) -> Array:
         """The plant's states, ``(B, n_states)``."""
@@ -201,6 +201,14 @@ class KalmanObserver:
         """The disturbances of its inputs, ``(B, nu)``; zero where none are estimated."""
         found = known.x[:, self.mpc.layout.n_states :]
         return found if self.n_disturbances else np.zeros((len(found), self.mpc.nu))
+
+
+def _finite(found: Estimate, before: Estimate) -> Estimate:
+    """What was found; what was known before, where a model ran away so far that numbers end."""
+    lost = ~(np.isfinite(found.x).all(axis=1) & np.isfinite(found.P).all(axis=(1, 2)))
+    if lost.any():
+        found.x[lost], found.P[lost] = before.x[lost], before.P[lost]
+    return found
 
 
 def _outputs(outputs: Outputs, n: int) -> ca.Function:
