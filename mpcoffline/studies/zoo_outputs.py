@@ -39,7 +39,7 @@ class Outcome:
         plant: Name of the plant.
         seed: The seed.
         starts: Number of episodes of each controller, from the same starts.
-        shown: Which states are measured, of how many.
+        shown: Places of the states that are measured, of how many.
         mpc_1: Cost of the rough MPC behind an observer.
         yardstick: Cost of the plant file's best MPC behind an observer with the noise as identified.
         learned: Cost of the learned MPC behind its own.
@@ -124,7 +124,7 @@ def _fill(found: Found, case: Case, tell: Callable[[str], None]) -> None:
     n = nominal.layout.n_states
     states = log.values().observations[:, :n]
     places = list(getattr(plant.module, "OUTPUTS", None) or shown_states(nominal, log))
-    found["shown"] = f"{', '.join(str(nominal.layout.y_labels[i]) for i in places)} of {n}"
+    found["shown"] = f"{', '.join(map(str, places))} of {n}"
     noise = NOISE * states[:, places].std(axis=0)
     first = states[log.episodes.firsts]
     spread = np.maximum(first.std(axis=0), _LEAST_SPREAD * states.std(axis=0))
@@ -264,9 +264,9 @@ def report(outcomes: Sequence[Outcome]) -> str:
         f" recommended of these: **{sum(o.worse and o.verdict == 'recommend' for o in done)}**",
     ]
     lines += [f"* Failed: {o.plant} {o.seed}: {o.error}" for o in rows if o.error]
-    header = ["plant", "seed", "measured", "MPC_1", "yardstick", "learned", "over the yardstick", "handed out", "s"]
+    header = ["plant", "seed", "measured states", "MPC_1", "yardstick", "learned", "over the yardstick", "handed out", "s"]
     header += ["expected", "verdict", "hardly told by the log"]
-    return "\n".join([*lines, "", Table(header, [_cells(o) for o in done], align="llrrrrrlrrll").markdown(), ""])
+    return "\n".join([*lines, "", Table(header, [_cells(o) for o in done], align="lllrrrrlrrll").markdown(), ""])
 
 
 def _cells(o: Outcome) -> list[str]:

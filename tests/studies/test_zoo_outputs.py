@@ -99,7 +99,7 @@ def test_a_case_is_learned_from_a_place_alone(mass: str, monkeypatch: pytest.Mon
     told: list[str] = []
     done = zoo_outputs.run_case(Case(mass, "mass", 0, 6), told.append)
     assert done.error == ""
-    assert done.shown == "observation 0 of 2"
+    assert done.shown == "0 of 2"
     assert done.near
     assert not done.worse
     assert done.gain == pytest.approx(done.learned - done.mpc_1)
@@ -108,4 +108,4 @@ def test_a_case_is_learned_from_a_place_alone(mass: str, monkeypatch: pytest.Mon
     page = report([done, Outcome("other", 1, 6, error="ValueError: no")])
     assert "**1 of 1**" in page
     assert "* Failed: other 1: ValueError: no" in page
-    assert "| mass | 0 | observation 0 of 2 |" in page
+    assert "| mass | 0 | 0 of 2 |" in page
