@@ -264,8 +264,8 @@ def report(outcomes: Sequence[Outcome]) -> str:
         f" recommended of these: **{sum(o.worse and o.verdict == 'recommend' for o in done)}**",
     ]
     lines += [f"* Failed: {o.plant} {o.seed}: {o.error}" for o in rows if o.error]
-    header = ["plant", "seed", "measured states", "MPC_1", "yardstick", "learned", "over the yardstick", "handed out", "s"]
-    header += ["expected", "verdict", "hardly told by the log"]
+    header = ["plant", "seed", "measured states", "MPC_1", "yardstick", "learned", "over the yardstick", "handed out"]
+    header += ["s", "expected", "verdict", "hardly told by the log"]
     return "\n".join([*lines, "", Table(header, [_cells(o) for o in done], align="lllrrrrlrrll").markdown(), ""])
 
 
