@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
@@ -15,11 +16,13 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.component import numbers
 from mpcoffline.mpc.expressions import traced
 from mpcoffline.mpc.rest import at_rest
+from mpcoffline.mpc.torch_twin import TorchTwin
 
 #: Outputs: which states a sensor shows, or x ``(n_states, 1)`` -> y as a CasADi column.
 Outputs = Sequence[int] | Callable[[ca.SX], Any]
 
 _SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
+_MANY = 100  # points, from which on torch, an operation at a time, is faster than CasADi, a point at a time
 _RANDOM_WALK = 1e3  # steps, over which a disturbance of an unbounded input would have come about
 
 
@@ -59,8 +62,8 @@ class OutputModel:
         theta = ca.SX.sym("theta", mpc.space.size)
         disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
         ahead, seen = ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:]), self.function(z[:n])
-        self._ahead = ca.Function("ahead", [z, acting, theta], [ahead, ca.densify(ca.jacobian(ahead, z))])
-        self._seen = ca.Function("seen", [z], [seen, ca.densify(ca.jacobian(seen, z))])
+        self._ahead = _WithSlopes("ahead", [z, acting, theta], ahead)
+        self._seen = _WithSlopes("seen", [z], seen)
         self._identity = np.eye(n + m)
 
     def ahead(self, known: Estimate, acting: Array, theta: Array, Q: Array) -> tuple[Estimate, Array]:
@@ -74,7 +77,7 @@ class OutputModel:
             theta: Parameters, ``(size,)``, or ``(B, size)``.
             Q: Covariance of what the model misses, ``(n, n)`` or ``(B, n, n)``.
         """
-        x, F = _called(self._ahead, known.x, acting, theta)
+        x, F = self._ahead(known.x, acting, theta)
         failed = ~(np.isfinite(x).all(axis=1) & np.isfinite(F).all(axis=(1, 2)))
         if failed.any():
             x[failed], F[failed] = known.x[failed], self._identity
@@ -82,19 +85,17 @@ class OutputModel:
 
     def seen(self, x: Array) -> Array:
         """Outputs without noise of states ``(B, n)``, ``(B, n_outputs)``."""
-        return _called(self._seen, x)[0]
+        return self._seen(x)[0]
 
-    def corrected(self, known: Estimate, y: Array, R: Array) -> tuple[Estimate, Array, Array]:
-        """What is known with outputs y ``(B, n_outputs)``, the innovations, and their covariance S.
-
-        Outputs that are NaN are not there: their innovation is zero, and S that of the noise alone.
+    def corrected(self, known: Estimate, y: Array, R: Array) -> Estimate:
+        """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there.
 
         Args:
             known: Before them.
             y: The outputs.
             R: Covariance of their noise, ``(n_outputs, n_outputs)`` or ``(B, n_outputs, n_outputs)``.
         """
-        seen, H = _called(self._seen, known.x)
+        seen, H = self._seen(known.x)
         missing = ~np.isfinite(y)
         innovation = y - seen
         if missing.any():
@@ -104,7 +105,30 @@ class OutputModel:
         gain = np.linalg.solve(S, HP).swapaxes(1, 2)
         left = self._identity - gain @ H
         P = left @ known.P @ left.swapaxes(1, 2) + gain @ R @ gain.swapaxes(1, 2)
-        return Estimate(known.x + (gain @ innovation[:, :, None])[:, :, 0], P), innovation, S
+        return Estimate(known.x + (gain @ innovation[:, :, None])[:, :, 0], P)
+
+    def corrected_in_turn(self, known: Estimate, y: Array, variances: Array) -> tuple[Estimate, Array]:
+        """What is known with outputs, and minus twice their log likelihood, ``(B,)``, but for a constant.
+
+        One output after the other, which is the same as all at once where their errors are independent, and faster.
+
+        Args:
+            known: Before them.
+            y: The outputs, ``(B, n_outputs)``; those that are NaN are not there.
+            variances: Of their errors, ``(B, n_outputs)``.
+        """
+        seen, H = self._seen(known.x)
+        x, P, evidence = known.x, known.P, np.zeros(len(y))
+        for j in range(y.shape[1]):
+            h, heard = H[:, j], np.isfinite(y[:, j])
+            Ph = (P @ h[:, :, None])[:, :, 0]
+            S = np.einsum("bi,bi->b", h, Ph) + variances[:, j]
+            innovation = np.where(heard, y[:, j] - seen[:, j] - np.einsum("bi,bi->b", h, x - known.x), 0.0)
+            gain = np.where(heard, 1.0 / S, 0.0)[:, None] * Ph
+            x = x + gain * innovation[:, None]
+            P = P - gain[:, :, None] * Ph[:, None, :]
+            evidence += np.where(heard, innovation**2 / S + np.log(S), 0.0)
+        return Estimate(x, P), evidence
 
 
 class KalmanObserver:
@@ -191,7 +215,7 @@ class KalmanObserver:
 
     def corrected(self, known: Estimate, y: Array) -> Estimate:
         """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there."""
-        return _finite(self._model.corrected(known, y, self._R)[0], known)
+        return _finite(self._model.corrected(known, y, self._R), known)
 
     def states(self, known: Estimate) -> Array:
         """The plant's states, ``(B, n_states)``."""
@@ -222,11 +246,36 @@ def _outputs(outputs: Outputs, n: int) -> ca.Function:
     return ca.Function("outputs", [x], [x[[int(i) for i in places]]])
 
 
-def _called(function: ca.Function, *arguments: Array) -> tuple[Array, Array]:
-    """A function of columns and its Jacobian at rows of arguments ``(B, ...)``: ``(B, m)`` and ``(B, m, n)``."""
-    value, slopes = function(*(argument.T if argument.ndim > 1 else argument for argument in arguments))
-    m, B = value.shape
-    return np.array(value.full().T), np.array(slopes.full().reshape(m, B, -1).swapaxes(0, 1))
+class _WithSlopes:
+    """A function of columns and its Jacobian by the first of them, at many points.
+
+    Args:
+        name: What it is.
+        symbols: Its arguments.
+        value: Its value, ``(m, 1)``.
+    """
+
+    def __init__(self, name: str, symbols: list[ca.SX], value: ca.SX) -> None:
+        slopes = ca.densify(ca.jacobian(value, symbols[0]))
+        self._function = ca.Function(name, symbols, [ca.densify(value), slopes])
+        self._joined = ca.Function(name, symbols, [ca.densify(ca.vertcat(value, ca.vec(slopes)))])
+        self._twin: TorchTwin | None = None
+        self._has_twin = True
+
+    def __call__(self, *arguments: Array) -> tuple[Array, Array]:
+        """At rows of arguments ``(B, ...)``: ``(B, m)`` and ``(B, m, n)``."""
+        B, m = len(arguments[0]), self._function.numel_out(0)
+        if B >= _MANY and self._has_twin and self._twin is None:
+            try:
+                self._twin = TorchTwin(self._joined)
+            except InvalidArgumentError:  # an operation that torch has not
+                self._has_twin = False
+        if B >= _MANY and self._twin is not None:
+            with torch.no_grad():
+                joined = self._twin(*(torch.from_numpy(np.ascontiguousarray(each)) for each in arguments)).numpy()
+            return joined[:, :m].copy(), joined[:, m:].reshape(B, -1, m).swapaxes(1, 2).copy()
+        value, slopes = self._function(*(each.T if each.ndim > 1 else each for each in arguments))
+        return np.array(value.full().T), np.array(slopes.full().reshape(m, B, -1).swapaxes(0, 1))
 
 
 def _vector(name: str, given: ArrayLike, size: int) -> Array:

@@ -128,18 +128,12 @@ def filtered_outputs(
     def diagonal(values: Array) -> Array:
         return every(values)[:, :, None] ** 2 * np.eye(values.shape[-1])
 
-    theta, Q, R = every(found.theta), diagonal(found.process), diagonal(found.noise)
+    theta, Q, variances = every(found.theta), diagonal(found.process), every(found.noise) ** 2
     known = Estimate(every(found.start).copy(), np.tile(np.diag(spread**2), (m * E, 1, 1)))
     likelihood, history, ahead = np.zeros(m), [], []
     for k in range(T + 1):
-        y = np.tile(data.y[k], (m, 1))
-        known, innovation, S = model.corrected(known, y, R)
-        heard = np.isfinite(y)
-        whitened = np.linalg.solve(S, innovation[:, :, None])[:, :, 0]
-        # Of outputs that are not there, S holds the noise alone, which is no evidence.
-        silent = np.where(heard, 0.0, np.log(np.einsum("bii->bi", R))).sum(axis=1)
-        term = np.einsum("bi,bi->b", innovation, whitened) + np.linalg.slogdet(S)[1] - silent
-        likelihood += 0.5 * term.reshape(m, E).sum(axis=1)
+        known, evidence = model.corrected_in_turn(known, np.tile(data.y[k], (m, 1)), variances)
+        likelihood += 0.5 * evidence.reshape(m, E).sum(axis=1)
         history.append(known)
         if k < T:
             known, F = model.ahead(known, np.tile(data.acting[k], (m, 1)), theta, Q)
