@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
     from mpcoffline.datasets.table.transitions import TransitionTable
-    from mpcoffline.learner.learner import Callback, OfflineMPCLearner
+    from mpcoffline.learner.callbacks import Callback
+    from mpcoffline.learner.learner import OfflineMPCLearner
     from mpcoffline.mpc import MPC
 
 app = typer.Typer()

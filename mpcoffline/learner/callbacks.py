@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.datasets.table.transitions import TransitionTable
+
+if TYPE_CHECKING:
+    from .learner import OfflineMPCLearner
+
+#: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
+Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
+#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
+#: ends the fit there. One with a method ``on_fit_end()`` has it called when the fit ends, for whatever reason.
+Callback = Callable[["OfflineMPCLearner", int, int], Any]
 
 
 def check_callbacks(callbacks: Sequence[object]) -> None:

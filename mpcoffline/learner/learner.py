@@ -27,7 +27,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.shown import parameter_table
 from mpcoffline.simulation.polishing import check_search
 
-from .callbacks import asks_to_end, check_callbacks
+from .callbacks import Callback, Evaluator, asks_to_end, check_callbacks
 from .candidates import Candidates, candidates_of, check_also
 from .checkpoint import Checkpoint, History
 from .effort import core_seconds
@@ -41,11 +41,6 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 Learn = Literal["cost", "cost+model", "cost+model+constraints"]
-#: Called as ``evaluator(learner, table)``; its number joins the metrics of the epoch.
-Evaluator = Callable[["OfflineMPCLearner", TransitionTable], float]
-#: Called as ``callback(learner, epoch, total_step)`` at the end of each epoch; False, also numpy's or torch's,
-#: ends the fit there. One with a method ``on_fit_end()`` has it called when the fit ends, for whatever reason.
-Callback = Callable[["OfflineMPCLearner", int, int], Any]
 
 logger = logging.getLogger(__name__)
 
@@ -228,8 +223,7 @@ class OfflineMPCLearner:
             show_progress: Whether to draw a progress bar.
             also: Further MPCs of this plant by name, as one that runs already: candidates beside what is learned.
             start: An MPC that was learned before, as from a part of the data: identification begins there, too, and
-                ends at the better minimum. What the data leave open stays near the given values. What was found in
-                outputs by default.
+                ends at the better minimum. What the data leave open stays near the given values.
 
         Returns:
             ``[(epoch, metrics), ...]``, first the epochs of (VALUE) with ``value_loss``, then those of (FIT) with
@@ -280,10 +274,9 @@ class OfflineMPCLearner:
         if n_steps_per_epoch is not None:
             check_integers(1, n_steps_per_epoch=n_steps_per_epoch)
         method = self.method if n_steps is None else self.method.replaced({"value_n_steps": n_steps})
+        self.sensors = None
         if isinstance(dataset, OutputIdentification):
             self.sensors, start, dataset = dataset.sensors, start or dataset.mpc, dataset.table
-        else:
-            self.sensors = None
         table, observation_space = self._table(dataset)
         report = check(self.nominal_mpc, table)
         report.raise_for_errors()
@@ -371,8 +364,8 @@ class OfflineMPCLearner:
             MPCOfflineError: Before ``fit``, and where it learned from states.
         """
         if self.sensors is None:
-            expected, hint = "a fit of outputs", "Call fit(identify_from_outputs(mpc, log, outputs, ...))."
-            raise MPCOfflineError("learner", expected=expected, actual="a log of states, or none", hint=hint)
+            hint = "Call fit(identify_from_outputs(mpc, log, outputs, ...))."
+            raise MPCOfflineError("learner", expected="a fit of outputs", actual="states, or no fit", hint=hint)
         return OutputFeedbackPolicy(self.policy, self.sensors.observer(self.policy.mpc))
 
     def _table(self, dataset: MinariDataset | TransitionTable | str) -> tuple[TransitionTable, spaces.Box | None]:

@@ -10,7 +10,8 @@ import lq_plant
 import pytest
 
 from mpcoffline.core.errors import MPCOfflineError
-from mpcoffline.learner.learner import Callback, OfflineMPCLearner
+from mpcoffline.learner.callbacks import Callback
+from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learner.loggers import CSVLogger, TensorBoardLogger
 
 
