@@ -22,7 +22,7 @@ from mpcoffline.mpc.torch_twin import TorchTwin
 Outputs = Sequence[int] | Callable[[ca.SX], Any]
 
 _SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
-_MANY = 100  # points, from which on torch, an operation at a time, is faster than CasADi, a point at a time
+_MANY = 500  # points, from which on torch, an operation at a time, is faster than CasADi, a point at a time
 _RANDOM_WALK = 1e3  # steps, over which a disturbance of an unbounded input would have come about
 
 
