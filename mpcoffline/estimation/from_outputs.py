@@ -46,7 +46,10 @@ _STEP = 1e-4  # of differences
 _UNKNOWN = 0.5  # of the prior's standard deviation: what is left so wide was not told by the log
 _AHEAD = 15  # steps, as models of the log are judged by
 _NOTHING = 0.7  # of what outputs move, missed: such a model says little more than that they stay
-_SAYS_NOTHING = "That is hardly better than to say that they stay: is the model's structure right, or an input unknown?"
+_SAYS_NOTHING = (
+    "That is hardly better than to say that they stay: the model's structure may be wrong, an input unknown, or they"
+    " move little more than their noise."
+)
 _SEEN = 0.5  # share of a state's variance that outputs have to remove
 
 
@@ -236,9 +239,10 @@ class _Search:
             fallen = value - float(losses[best])
             if fallen > 0.0:
                 v, value = points[best], float(losses[best])
-            if best > 0 or not fallen > _DONE:
-                if fresh and not fallen > _DONE:
-                    break
+            done = not fallen > _DONE
+            if done and fresh:
+                break
+            if done or best > 0:
                 curved = None
         return v
 

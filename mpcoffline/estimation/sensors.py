@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -41,7 +41,7 @@ class Sensors:
     start: Array
     start_spread: Array
     disturbance: Array | None = None
-    undetermined: tuple[str, ...] = field(default=())
+    undetermined: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, observer: KalmanObserver) -> Sensors:

@@ -298,7 +298,8 @@ class Plant:
         Columns are found by name, whatever the case and signs between letters, with the unit in the header, as
         ``h1 [mm]``, ``h1 (mm)`` or ``h1_mm``, and converted to the plant's. Rows may be at any times: states are taken
         linearly between them, signals as last known, inputs by their mean over the control interval. What cannot be
-        is left out, and gaps begin new episodes; ``table.report`` says what and why. Costs are the plant's own.
+        is left out, and gaps begin new episodes; ``table.report`` says what and why. Costs are the plant's own; of a
+        plant with outputs they are zero until :meth:`identify` has found the states.
 
         Args:
             log: A file (CSV and other text, Parquet, Arrow), a frame (polars, pandas, pyarrow), or a list of them.
@@ -357,7 +358,8 @@ class Plant:
         Raises:
             InvalidArgumentError: For a plant without outputs, or a state that nobody measures and whose ``start`` is
                 one number.
-            InvalidDataError: As :func:`~mpcoffline.estimation.identify_from_outputs`.
+            InvalidDataError: For a log of other columns, inputs beyond their bounds, or as
+                :func:`~mpcoffline.estimation.identify_from_outputs`.
         """
         return identified(self, log, seed)
 

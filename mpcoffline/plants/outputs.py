@@ -122,7 +122,8 @@ def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentific
     if not plant.outputs:
         hint = "Where the states themselves are measured, a learner takes the log as it is."
         raise InvalidArgumentError("outputs", expected="a plant with outputs", actual="none", hint=hint)
-    function = outputs_function(plant)
+    mpc, function = plant.mpc(), outputs_function(plant)
+    log.check_fits(mpc.ny - mpc.layout.n_states + len(plant.outputs), mpc.nu, *plant.action_bounds)
     low, high = np.array([state.starts for state in plant.states]).T
     spread = (high - low) / np.sqrt(12.0)
     for i in np.flatnonzero(spread == 0.0).tolist():
@@ -132,7 +133,7 @@ def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentific
             name = f"state {plant.states[i].name}: start"
             raise InvalidArgumentError(name, expected=expected, actual=repr(plant.states[i].start))
         spread[i] = np.std(log.values().observations[:, own[0]])
-    found = identify_from_outputs(plant.mpc(), log, function, start=0.5 * (low + high), start_spread=spread, seed=seed)
+    found = identify_from_outputs(mpc, log, function, start=0.5 * (low + high), start_spread=spread, seed=seed)
     return replace(found, table=_with_costs(plant, found, log.names[len(plant.outputs) :]))
 
 

@@ -252,9 +252,9 @@ def report(outcomes: Sequence[Outcome]) -> str:
     lines = [
         "# Outputs: half of the states hidden",
         "",
-        f"`scripts/bench_zoo --outputs`: {len(done)} cases, each a plant file and a seed. Half of the states are"
-        f" measured, with a noise of {NOISE:.0%} of their spread; which ones says a rough model: those that tell most"
-        " of the rest."
+        f"`scripts/bench_zoo --outputs`: {len(done)} cases, each a plant file and a seed. Half of the states,"
+        f" rounded up, are measured, with a noise of {NOISE:.0%} of their spread; which ones says the plant file, or a"
+        " rough model: those that tell most of the rest."
         " All controllers act behind extended Kalman filters. That of the yardstick, the plant file's best MPC, has the"
         " noise that was identified; MPC_1 has the best of four. Times in s of one core.",
         "",

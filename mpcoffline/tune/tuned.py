@@ -68,12 +68,20 @@ class Tuned:
 
     @property
     def policy(self) -> MPCPolicy:
-        """What ``policy.zip`` holds: the proposal, or MPC_1 where the verdict is to keep that."""
+        """What ``policy.zip`` holds: the proposal, or MPC_1 where the verdict is to keep that.
+
+        Raises:
+            FileFormatError: If it takes outputs, as :attr:`output_policy`, or is damaged.
+        """
         return MPCPolicy.load(self.folder / POLICY)
 
     @property
     def output_policy(self) -> OutputFeedbackPolicy:
-        """The same where the plant's outputs are measured in place of its states."""
+        """The same where the plant's outputs are measured in place of its states.
+
+        Raises:
+            FileFormatError: If it takes states, as :attr:`policy`, or is damaged.
+        """
         return OutputFeedbackPolicy.load(self.folder / POLICY)
 
     @property

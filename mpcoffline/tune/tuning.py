@@ -126,7 +126,12 @@ def _reader(plant: Plant) -> dict[str, Any]:
     if not plant.outputs:
         return {"name": plant.name} | plant.wanted.to_json(plant.cost_function)
     shown = {"outputs": function_to_json(plant.outputs_function), "cost": function_to_json(plant.cost_function)}
-    return {"name": plant.name, "dt": float(plant.dt), **shown}
+    return {
+        "name": plant.name,
+        "dt": float(plant.dt),
+        "starts": [list(state.starts) for state in plant.states],
+        **shown,
+    }
 
 
 def _said(found: LogCheck) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def mass(tmp_path: Path) -> str:
 
 
 def test_what_tells_most_of_the_rest_is_measured() -> None:
-    """Of two masses in a row the places: of a speed a place is not known."""
+    """Of two masses in a row, of which the first one moves the second, not both states of the first."""
 
     def step(x: Any, u: Any, _: Any) -> Any:
         return x + 0.1 * ca.vertcat(x[1], u[0] - x[0], x[3], x[0] - x[2])

@@ -47,11 +47,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     truth, rough, log = folder / "truth.py", folder / "rough.py", folder / "log.csv"
     truth.write_text(PLANT.replace("GAIN", "0.07"))
     rough.write_text(PLANT.replace("GAIN", "0.11"))
-    env, rng, t, lines = load_plant(truth).env(spread=0.0), np.random.default_rng(0), 0.0, ["time [s],gauge,pump [V]"]
+    env, rng, lines = load_plant(truth).env(spread=0.0), np.random.default_rng(0), ["time [s],gauge,pump [V]"]
+    t = u = 0.0
     for episode in range(9):
         y, _ = env.reset(seed=episode)
         for k in range(41):
-            u = rng.uniform(0.5, 5.5) if k % 5 == 0 else u  # noqa: F821 -- the one before
+            u = rng.uniform(0.5, 5.5) if k % 5 == 0 else u
             lines.append(f"{t:.0f},{y[0]:.6f},{u:.6f}")
             y, t = env.step(np.array([u], np.float32))[0], t + 5.0
         t += 300.0
@@ -90,6 +91,7 @@ def test_from_a_log_of_outputs_to_a_policy_on_outputs(files: tuple[Path, Path], 
 
 def test_what_needs_states_says_so(files: tuple[Path, Path]) -> None:
     plant, log = files
-    for command in (["check", str(plant), str(log)], ["learn", "--plant", str(plant), "--log", str(log)]):
-        done = CliRunner().invoke(app, command)
+    for command in ("check", "learn"):
+        done = CliRunner().invoke(app, [command, str(plant), str(log)])
         assert done.exit_code != 0
+        assert f"expected states that are measured, for {command}" in done.output
