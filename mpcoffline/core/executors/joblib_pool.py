@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from .carried import Carried, done_with
@@ -39,31 +40,34 @@ class Joblib(Executor[Job, Result]):
 
         waiting, tries = dict(jobs), 0
         while waiting:
-            answers = self._answers(waiting)
             try:
-                for name, outcome in answers:
-                    del waiting[name]
-                    tries = 0
-                    yield name, result_of(name, outcome)
+                with self._answers(waiting) as answers:  # the first jobs are handed out in here: it may fail, too
+                    for name, outcome in answers:
+                        del waiting[name]
+                        tries = 0
+                        yield name, result_of(name, outcome)
             except BrokenProcessPool as error:
                 tries += 1
                 if tries == _TRIES:
                     how = f"a process that died, as another before ({len(waiting)} jobs are not done)"
                     raise lost(next(iter(waiting)), how) from error
-            finally:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)  # that what still works is ended, as it should
-                    answers.close()
 
-    def _answers(self, jobs: Mapping[str, Job]) -> Any:
-        """A generator of names and outcomes."""
+    @contextmanager
+    def _answers(self, jobs: Mapping[str, Job]) -> Iterator[Iterator[tuple[str, Outcome]]]:
+        """Names and outcomes, in the order in which jobs end; leaving the block ends what still works."""
         joblib, key, content = self._joblib, self._carried.key, self._carried.content
         active, _ = joblib.parallel.get_active_backend()
         chosen = {}
         if type(active).__name__ == "LokyBackend":
             chosen = {"backend": joblib.parallel.LokyBackend(inner_max_num_threads=1)}
         pool = joblib.Parallel(n_jobs=self._n, return_as="generator_unordered", batch_size=1, **chosen)
-        return pool(joblib.delayed(_answer)(name, key, content, job) for name, job in jobs.items())
+        answers = pool(joblib.delayed(_answer)(name, key, content, job) for name, job in jobs.items())
+        try:
+            yield answers
+        finally:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that what still works is ended, as it should
+                answers.close()
 
 
 def _answer(name: str, key: str, content: bytes, job: Any) -> tuple[str, Outcome]:

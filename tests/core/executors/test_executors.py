@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import time
 from collections.abc import Iterator
@@ -64,6 +65,23 @@ def test_a_lost_worker_costs_no_job_and_a_deadly_job_is_named(kind: str, tmp_pat
     assert parallel.map(eval, {"a": "1", "dies once": once, "b": "2"}, 2, executor=kind) == [1, True, 2]
     with pytest.raises(parallel.JobError, match=r"job '(dies|too)'.*as another before"):
         parallel.map(os._exit, {"dies": 3, "too": 3}, 2, executor=kind)
+
+
+def test_a_worker_that_dies_while_jobs_are_handed_out_costs_no_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Joblib tells of a worker lost to the first job where it hands out the second."""
+    joblib = pytest.importorskip("joblib")
+    process_executor = importlib.import_module("joblib.externals.loky.process_executor")
+    submit, calls = joblib.parallel.LokyBackend.submit, []
+
+    def dies_once(self: Any, *args: Any, **kwargs: Any) -> Any:
+        calls.append(self)
+        if len(calls) == 2:
+            raise process_executor.TerminatedWorkerError("the first worker is gone")
+        return submit(self, *args, **kwargs)
+
+    monkeypatch.setattr(joblib.parallel.LokyBackend, "submit", dies_once)
+    assert parallel.map(abs, [-1, -2, -3], 2, executor="joblib") == [1, 2, 3]
+    assert len(calls) == 5
 
 
 def test_workers_have_one_thread_and_no_workers(kind: str) -> None:
