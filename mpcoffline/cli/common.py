@@ -38,7 +38,7 @@ from .others import AddedCommand, added_commands
 if TYPE_CHECKING:
     from gymnasium import Env
 
-    from mpcoffline.control.policy import MPCPolicy
+    from mpcoffline.control.loading import Acting
     from mpcoffline.learner.learner import OfflineMPCLearner
 
 USER_ERROR = 1
@@ -185,12 +185,12 @@ def say_file(what: str, path: Path) -> None:
     say(f"{what}: [bold]{escape(str(path))}[/]")
 
 
-def loaded_policy(path: Path) -> MPCPolicy:
+def loaded_policy(path: Path) -> Acting:
     """The policy in a policy's or learner's file."""
     with working("Loading"):
-        from mpcoffline.control.policy import MPCPolicy
+        from mpcoffline.control.loading import load_policy
 
-        return MPCPolicy.load(path)
+        return load_policy(path)
 
 
 def loaded_learner(path: Path) -> OfflineMPCLearner:

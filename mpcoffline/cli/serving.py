@@ -12,7 +12,7 @@ from .common import check_out, examples, loaded_policy, message, print_json, say
 from .options import Controller, Json, Seed
 
 if TYPE_CHECKING:
-    from mpcoffline.control.policy import MPCPolicy
+    from mpcoffline.control.loading import Acting
     from mpcoffline.control.serving import Clock, Device
 
 app = typer.Typer()
@@ -94,7 +94,9 @@ def serve(
     else:
         plant = LineDevice(host, int(port), timeout=_ANSWER * every)
     with ExitStack() as closing:
-        decisions = None if log is None else closing.enter_context(DecisionLog(log, controller.mpc))
+        decisions = (
+            None if log is None else closing.enter_context(DecisionLog(log, controller.mpc, controller.y_labels))
+        )
         service = Service(
             controller,
             plant,
@@ -134,9 +136,7 @@ def _numbers(given: dict[str, str]) -> dict[str, float]:
     return found
 
 
-def _simulated(
-    file: Path, policy: MPCPolicy, period: float, seed: int, periods: int | None
-) -> tuple[Device, Clock, int]:
+def _simulated(file: Path, policy: Acting, period: float, seed: int, periods: int | None) -> tuple[Device, Clock, int]:
     """A plant file as a device, its clock, and how many periods."""
     import time
 
@@ -146,4 +146,5 @@ def _simulated(
     plant, clock = load_plant(file), VirtualClock(time.time())
     count = plant.steps if periods is None else periods
     env = plant.env(steps=count + 1)
-    return SimulatedDevice(env, policy.mpc, clock, period=period, seed=seed), clock, count
+    device = SimulatedDevice(env, policy.mpc, clock, period=period, seed=seed, measured=policy.y_labels)
+    return device, clock, count

@@ -19,6 +19,10 @@ from mpcoffline.solvers import DDPSolver, starts
 from mpcoffline.solvers.ddp.codegen import algorithm, generated, text
 from mpcoffline.solvers.scaling import input_units
 
+from . import export_observer as observing
+from .export_observer import array as _array, number as _number
+from .loading import Acting, load_policy
+from .output_feedback import OutputFeedbackPolicy
 from .policy import MPCPolicy
 
 _log = logging.getLogger(__name__)
@@ -33,7 +37,7 @@ _ALIKE = 1e-3  # costs that differ by less, relative to how much those of the dr
 _SAME_PLAN = 1e-3  # inputs that differ by less, relative to their range, are one plan: a minimum can be flat
 
 
-def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str]) -> list[Path]:
+def export_c(policy: Acting | str | PathLike[str], folder: str | PathLike[str]) -> list[Path]:
     """Writes a policy as C99 code that a microcontroller's compiler takes.
 
     ``mpc_controller.h`` declares ``mpc_step(parameters, state, y, u)`` and documents every parameter with its unit;
@@ -42,6 +46,10 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
     ``test_vectors.txt``, closed loops of the policy on its own model. y is the observation; past inputs that the MPC's
     state holds besides are kept in ``mpc_state``. Corners of the model are not rounded in C: it acts as the policy with
     ``round_corners=False`` does.
+
+    A policy that sees outputs comes with its observer: ``mpc_observer.h`` and ``mpc_observer.c``, whose
+    ``mpc_observer_step(parameters, observer, state, measured, u)`` estimates the states and calls ``mpc_step``, with a
+    test and vectors of their own.
 
     Args:
         policy: The policy, or the file of one or of a learner.
@@ -56,19 +64,23 @@ def export_c(policy: MPCPolicy | str | PathLike[str], folder: str | PathLike[str
         CompilerError: If there is no working C compiler; the test vectors need one.
         StorageError: If nothing could be written there, before anything is compiled.
     """
-    check_output_folder(folder, _FILES)
-    if not isinstance(policy, MPCPolicy):
-        policy = MPCPolicy.load(policy)
-    mpc = policy.mpc
-    options = policy.solver_options if policy.solver_name == "ddp" else {}
+    check_output_folder(folder, (*_FILES, *observing.FILES))
+    if not isinstance(policy, Acting):
+        policy = load_policy(policy)
+    mpc, inner = policy.mpc, policy.policy if isinstance(policy, OutputFeedbackPolicy) else policy
+    options = inner.solver_options if inner.solver_name == "ddp" else {}
     solver = DDPSolver(mpc, **options)
     rows = _vectors(
         MPCPolicy(mpc, "ddp", **(options | {"round_corners": False}))
     )  # as the C, which has no corners rounded
     test = _TEST.replace("@RANGES@", ", ".join(map(_number, _ranges(mpc, rows))))
     vectors = "".join(" ".join([str(int(reset)), *map(_number, row)]) + "\n" for reset, *row in rows)
-    texts = (_header(mpc, solver), _source(mpc, solver), test, vectors or "\n", _CMAKE)
+    observed = isinstance(policy, OutputFeedbackPolicy)
+    cmake = _CMAKE.replace("@OBSERVER@", " mpc_observer.c" * observed) + _CMAKE_OBSERVER * observed
+    texts = (_header(mpc, solver), _source(mpc, solver), test, vectors or "\n", cmake)
     contents = dict(zip(_FILES, texts, strict=True))
+    if isinstance(policy, OutputFeedbackPolicy):
+        contents |= observing.observer_files(policy, options)
     return [write_file(Path(folder) / name, content) for name, content in contents.items()]
 
 
@@ -226,16 +238,6 @@ def _reached(mpc: MPC) -> tuple[Array, Array, Array]:
     return rest[: mpc.ny], low - (high - low) / 2, high + (high - low) / 2
 
 
-def _number(value: float) -> str:
-    return repr(float(value)) if np.isfinite(value) else "INFINITY" if value > 0 else "-INFINITY"
-
-
-def _array(name: str, values: object) -> str:
-    numbers = [_number(v) for v in np.asarray(values, dtype=np.float64).ravel()]
-    rows = [", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8)]
-    return f"static const double {name}[] = {{\n    " + ",\n    ".join(rows) + "};"
-
-
 _HEADER = """\
 /* A model predictive controller, written by mpcoffline. C99; needs math.h and nothing else, allocates nothing.
  *
@@ -354,7 +356,7 @@ if(NOT CMAKE_BUILD_TYPE)
   set(CMAKE_BUILD_TYPE Release)
 endif()
 
-add_library(mpc_controller STATIC mpc_controller.c)
+add_library(mpc_controller STATIC mpc_controller.c@OBSERVER@)
 target_include_directories(mpc_controller PUBLIC ${CMAKE_CURRENT_SOURCE_DIR})
 find_library(MATH_LIBRARY m)
 if(MATH_LIBRARY)
@@ -365,4 +367,10 @@ enable_testing()
 add_executable(mpc_test mpc_test.c)
 target_link_libraries(mpc_test PRIVATE mpc_controller)
 add_test(NAME replay COMMAND mpc_test ${CMAKE_CURRENT_SOURCE_DIR}/test_vectors.txt)
+"""
+
+_CMAKE_OBSERVER = """\
+add_executable(mpc_observer_test mpc_observer_test.c)
+target_link_libraries(mpc_observer_test PRIVATE mpc_controller)
+add_test(NAME observer COMMAND mpc_observer_test ${CMAKE_CURRENT_SOURCE_DIR}/observer_vectors.txt)
 """

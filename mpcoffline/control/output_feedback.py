@@ -17,6 +17,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.estimation.observer import Estimate, KalmanObserver
 from mpcoffline.estimation.sensors import Sensors
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.labels import Label
 from mpcoffline.solvers import Solver
 from mpcoffline.solvers.fallback import SolverStats
 
@@ -24,7 +25,7 @@ from .course import Course, course_from
 from .observations import checked_observation
 from .policy import MPCPolicy
 
-_OWN = 3  # arrays of the state that are the observer's: estimates, covariances, what acts; and of a course
+OWN = 3  # arrays of the state that are the observer's: estimates, covariances, what acts
 
 
 class OutputFeedbackPolicy(BasePolicy):
@@ -36,7 +37,7 @@ class OutputFeedbackPolicy(BasePolicy):
     of the estimate, as those of a sensor that is slower than the controller.
 
     With disturbances of the inputs (``KalmanObserver(disturbance=)``) the MPC plans what is to act, v, and
-    ``u = v - d`` is applied, within the bounds.
+    ``u = v - d`` is applied, within the bounds; past inputs that it holds are to act with the disturbance of now, too.
 
     Example:
         >>> observer = KalmanObserver(mpc, [0], noise=0.01, process=1e-3, start_spread=[1.0, 0.5])
@@ -88,7 +89,8 @@ class OutputFeedbackPolicy(BasePolicy):
 
         Returns:
             Actions ``(nu,)`` or ``(B, nu)`` as :meth:`mpcoffline.MPCPolicy.predict` does; and estimates ``(B, n)``,
-            covariances ``(B, n, n)``, what acts ``(B, nu + n_signals)``, and the MPC's own state.
+            covariances ``(B, n, n)``, what acts ``(B, nu + n_signals)``, and the MPC's own state. A row of NaN in the
+            third, of a state that is given, is a loop that has not begun: its estimate is the one before any output.
 
         Raises:
             InvalidArgumentError: For an observation of the wrong shape, or a state of another policy or batch size.
@@ -98,21 +100,20 @@ class OutputFeedbackPolicy(BasePolicy):
         y, signals = np.split(seen, [self.observer.n_outputs], axis=1)
         known, inner = self._before(state, episode_start, len(seen))
         known = self.observer.corrected(known, y)
-        full = np.hstack([self.observer.states(known), signals])
-        memory = course_from(mpc, inner, episode_start, len(seen))[1] if mpc.layout.n_memory else None
+        full, disturbance = np.hstack([self.observer.states(known), signals]), self.observer.disturbances(known)
+        plan, memory = course_from(mpc, inner, episode_start, len(seen))
+        if memory is not None:
+            inner = Course(plan.x, plan.u, memory + disturbance[:, mpc.layout.ages[0]], plan.multipliers)
         wanted, carried = self.policy.predict(full, inner, episode_start, deterministic)
-        disturbance = self.observer.disturbances(known)
         actions = wanted
         if self.observer.n_disturbances:
             space = self.policy.action_space
             assert isinstance(space, spaces.Box)  # noqa: S101 -- refused by the policy; narrows the type
             actions = np.clip((wanted - disturbance).astype(space.dtype), space.low, space.high)
-            if memory is not None:  # what acts later, too, is what was applied and the disturbance
-                later = mpc.layout.remembered(memory, actions.astype(np.float64) + disturbance)
-                carried = Course(carried[0], carried[1], later, *carried[_OWN:])
-        z = full if memory is None else np.hstack([full, memory])
-        acting = mpc.layout.split(z, actions.astype(np.float64) + disturbance)[1]
-        acting[:, : mpc.nu] -= disturbance
+        applied = actions.astype(np.float64)
+        if memory is not None:
+            carried = Course(carried[0], carried[1], mpc.layout.remembered(memory, applied), *carried[3:])
+        acting = mpc.layout.split(full if memory is None else np.hstack([full, memory]), applied)[1]
         return actions[0] if given.ndim == 1 else actions, (*known, acting, *carried)
 
     def _before(
@@ -123,16 +124,20 @@ class OutputFeedbackPolicy(BasePolicy):
             return self.observer.begin(n), None
         m = self.policy.mpc.layout.n_states + self.observer.n_disturbances
         sizes = [(n, m), (n, m, m), (n, len(self.policy.mpc.layout.acting))]
-        shapes = [np.shape(each) for each in state[:_OWN]]
+        shapes = [np.shape(each) for each in state[:OWN]]
         if shapes != sizes:
             raise InvalidArgumentError(
                 "state", expected=f"what predict returned for {n} loops, {sizes}", actual=f"arrays of {shapes}"
             )
-        known = self.observer.ahead(Estimate(*state[:2]), state[2])
+        begun = np.isfinite(state[2]).all(axis=1)
+        known = Estimate(*(np.array(each, dtype=np.float64) for each in state[:2]))
+        if begun.any():
+            moved = self.observer.ahead(known, np.where(begun[:, None], state[2], 0.0))
+            known.x[begun], known.P[begun] = moved.x[begun], moved.P[begun]
         if episode_start is not None and np.any(episode_start):
             started, fresh = np.broadcast_to(episode_start, (n,)).astype(bool), self.observer.begin(n)
             known.x[started], known.P[started] = fresh.x[started], fresh.P[started]
-        return known, state[_OWN:]
+        return known, state[OWN:]
 
     def estimates(self, state: tuple[NDArray[Any], ...]) -> tuple[Array, Array]:
         """The plant's states ``(B, n_states)`` and the disturbances ``(B, nu)`` in what :meth:`predict` returned."""
@@ -143,6 +148,12 @@ class OutputFeedbackPolicy(BasePolicy):
     def mpc(self) -> MPC:
         """The MPC that acts."""
         return self.policy.mpc
+
+    @property
+    def y_labels(self) -> tuple[Label, ...]:
+        """What the coordinates of an observation are called: outputs, then signals."""
+        layout = self.mpc.layout
+        return (*self.observer.labels, *layout.y_labels[layout.n_states :])
 
     @property
     def solver(self) -> Solver:

@@ -28,6 +28,7 @@ from mpcoffline.core.archive import (
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.labels import Label
 from mpcoffline.mpc.shown import html_of_mpc
 from mpcoffline.solvers import SOLVERS, Plan, Solver, changed_options, check_solver, make_solver
 from mpcoffline.solvers.fallback import Fallback, SolverStats
@@ -205,6 +206,11 @@ class MPCPolicy(BasePolicy):
     def __getstate__(self) -> dict[str, Any]:
         """Everything but a solver that was named, which is compiled code: a copy builds its own when first used."""
         return self.__dict__ | {"_solver": self._made}
+
+    @property
+    def y_labels(self) -> tuple[Label, ...]:
+        """What the coordinates of an observation are called."""
+        return self.mpc.layout.y_labels
 
     @property
     def solver(self) -> Solver:

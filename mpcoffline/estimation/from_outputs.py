@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
+from mpcoffline.mpc.labels import Label
 from mpcoffline.mpc.scaling import Scaling
 
 from .observer import KalmanObserver, OutputModel, Outputs
@@ -92,6 +94,7 @@ def identify_from_outputs(
     *,
     start: ArrayLike | None = None,
     start_spread: ArrayLike,
+    labels: Sequence[Label] = (),
     seed: int = 0,
 ) -> OutputIdentification:
     """Model parameters, noise and states from a log of outputs, by the largest likelihood of its innovations.
@@ -117,6 +120,7 @@ def identify_from_outputs(
             the log's own mean goes before it. At rest by default.
         start_spread: How far they are from that, standard deviation, ``(n_states,)``: the scale of states that nobody
             has measured.
+        labels: What the outputs are called, as :class:`KalmanObserver` takes them.
         seed: Picks rows and starts.
 
     Raises:
@@ -124,7 +128,7 @@ def identify_from_outputs(
         InvalidDataError: If an output never moves, rows are few, or episodes too short to see a state in them.
     """
     model = OutputModel(mpc, outputs)
-    given = KalmanObserver(mpc, outputs, 1.0, 0.0, start=start, start_spread=start_spread)
+    given = KalmanObserver(mpc, outputs, 1.0, 0.0, start=start, start_spread=start_spread, labels=labels)
     data = output_episodes(mpc, log, model.n_outputs)
     search = _Search(mpc, model, data.some(_ROWS, _LONGEST, seed), _first_start(given, data), given.start_spread, log)
     if len(log) < _ROWS_A_NUMBER * search.size:
@@ -141,7 +145,7 @@ def identify_from_outputs(
     states, seen = smoothed_states(model, data, found, given.start_spread)
     unknown += [f"{mpc.layout.y_labels[i]} (a state)" for i in np.flatnonzero(seen < _SEEN)]
     parts = found.noise, found.process, found.start, given.start_spread
-    sensors = Sensors(model.function, *parts, undetermined=tuple(unknown))
+    sensors = Sensors(model.function, *parts, undetermined=tuple(unknown), labels=given.labels)
     deviations = wide * np.where(search.coordinates.logarithmic, 1.0, search.coordinates.scale)
     table = with_states(log, states, data, model.n_outputs)
     missed = missed_ahead(model, data, found, given.start_spread, _AHEAD)

@@ -11,14 +11,16 @@ import torch
 from numpy.typing import ArrayLike
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.text import check_name, check_unit
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.component import numbers
 from mpcoffline.mpc.expressions import traced
+from mpcoffline.mpc.labels import Label
 from mpcoffline.mpc.rest import at_rest
 from mpcoffline.mpc.torch_twin import TorchTwin
 
-#: Outputs: which states a sensor shows, or x ``(n_states, 1)`` -> y as a CasADi column.
+#: Outputs: which states a sensor shows, or x ``(n_states, 1)`` -> y as a CasADi column or a list.
 Outputs = Sequence[int] | Callable[[ca.SX], Any]
 
 _SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
@@ -154,13 +156,15 @@ class KalmanObserver:
         start_spread: Standard deviation of their error, ``(n_states,)``.
         disturbance: How much a disturbance of each input changes in a step, ``(nu,)``, standard deviation: larger is
             faster, and noisier. None for none.
+        labels: What the outputs are called, with units; those of states that are measured, by default, else
+            ``output 0`` and so on.
 
     Attributes:
         n_outputs: Number of outputs.
 
     Raises:
         InvalidArgumentError: For numbers that are negative, of another size or not finite, outputs that are none of the
-            states, noise of zero, or more disturbances than outputs.
+            states, noise of zero, more disturbances than outputs, or labels of another number.
     """
 
     def __init__(
@@ -173,6 +177,7 @@ class KalmanObserver:
         start: ArrayLike | None = None,
         start_spread: ArrayLike,
         disturbance: ArrayLike | None = None,
+        labels: Sequence[Label] = (),
     ) -> None:
         n = mpc.layout.n_states
         self.mpc, self.n_disturbances = mpc, 0 if disturbance is None else mpc.nu
@@ -190,8 +195,23 @@ class KalmanObserver:
                 actual=f"{self.n_disturbances} inputs",
                 hint="More cannot be told apart. disturbance=None leaves them out.",
             )
+        self.labels = self._labels(outputs, labels)
         missed = self.process if self.disturbance is None else np.append(self.process, self.disturbance)
         self._Q, self._R = np.diag(missed**2), np.diag(self.noise**2)
+
+    def _labels(self, outputs: Outputs, given: Sequence[Label]) -> tuple[Label, ...]:
+        """What outputs are called."""
+        known = self.mpc.layout.labels.states
+        if not given and known and not callable(outputs):
+            return tuple(known[int(i)] for i in outputs)
+        labels = [Label(*each) for each in given] or [Label(f"output {i}") for i in range(self.n_outputs)]
+        if len(labels) != self.n_outputs:
+            expected = f"{self.n_outputs} of them, or none"
+            raise InvalidArgumentError("labels of outputs", expected=expected, actual=str(labels))
+        for label in labels:
+            check_name("name of an output", label.name)
+            check_unit(f"unit of {label.name}", label.unit)
+        return tuple(labels)
 
     def begin(self, n_loops: int) -> Estimate:
         """What is known before the first output of B loops."""
@@ -211,11 +231,13 @@ class KalmanObserver:
             acting: The inputs that act in it, dead time past, and the present signals, as ``mpc.layout.split`` gives
                 them, ``(B, nu + n_signals)``.
         """
-        return _finite(self._model.ahead(known, acting, self._theta, self._Q)[0], known)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a model that runs away
+            return _finite(self._model.ahead(known, acting, self._theta, self._Q)[0], known)
 
     def corrected(self, known: Estimate, y: Array) -> Estimate:
         """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there."""
-        return _finite(self._model.corrected(known, y, self._R), known)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _finite(self._model.corrected(known, y, self._R), known)
 
     def states(self, known: Estimate) -> Array:
         """The plant's states, ``(B, n_states)``."""
@@ -238,7 +260,8 @@ def _finite(found: Estimate, before: Estimate) -> Estimate:
 def _outputs(outputs: Outputs, n: int) -> ca.Function:
     x = ca.SX.sym("x", n)
     if callable(outputs):
-        y = ca.SX(ca.vertcat(*outputs(x)) if isinstance(outputs, (list, tuple)) else outputs(x))
+        given = outputs(x)
+        y = ca.SX(ca.vertcat(*given) if isinstance(given, (list, tuple)) else given)
         return traced("outputs", ca.Function("outputs", [x], [ca.densify(y)]))
     places = list(outputs)
     if not places or not all(isinstance(i, (int, np.integer)) and 0 <= i < n for i in places):

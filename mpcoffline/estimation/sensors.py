@@ -14,6 +14,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.expressions import function_from_json, function_to_json
+from mpcoffline.mpc.labels import Label
 
 from .observer import KalmanObserver
 from .plant import state_rows
@@ -33,6 +34,7 @@ class Sensors:
         start_spread: Standard deviation of their distance from it, ``(n_states,)``.
         disturbance: How much a disturbance of each input changes in a step, ``(nu,)``; None for none.
         undetermined: Names of parameters and states of which outputs hardly say anything.
+        labels: What the outputs are called, with units; may be none.
     """
 
     outputs: ca.Function
@@ -42,12 +44,13 @@ class Sensors:
     start_spread: Array
     disturbance: Array | None = None
     undetermined: tuple[str, ...] = ()
+    labels: tuple[Label, ...] = ()
 
     @classmethod
     def of(cls, observer: KalmanObserver) -> Sensors:
         """Those of an observer."""
         parts = observer.noise, observer.process, observer.start, observer.start_spread, observer.disturbance
-        return cls(observer.function, *parts)
+        return cls(observer.function, *parts, labels=observer.labels)
 
     @property
     def n_outputs(self) -> int:
@@ -56,7 +59,7 @@ class Sensors:
 
     def observer(self, mpc: MPC) -> KalmanObserver:
         """An observer for an MPC of this plant."""
-        known = {name: getattr(self, name) for name in ("start", "start_spread", "disturbance")}
+        known = {name: getattr(self, name) for name in ("start", "start_spread", "disturbance", "labels")}
         return KalmanObserver(mpc, self.outputs, self.noise, self.process, **known)
 
     def with_disturbance(self, disturbance: ArrayLike | None) -> Sensors:
@@ -93,6 +96,7 @@ class Sensors:
         arrays = {name: getattr(self, name).tolist() for name in ("noise", "process", "start", "start_spread")}
         disturbance = None if self.disturbance is None else self.disturbance.tolist()
         rest = {"disturbance": disturbance, "undetermined": list(self.undetermined)}
+        rest["labels"] = [list(label) for label in self.labels]
         return {"outputs": function_to_json(self.outputs), **arrays, **rest}
 
     @classmethod

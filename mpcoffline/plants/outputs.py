@@ -14,6 +14,7 @@ from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc.labels import Label
 
 from .calling import called, number
 from .quantities import State, check_quantity
@@ -133,7 +134,9 @@ def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentific
             name = f"state {plant.states[i].name}: start"
             raise InvalidArgumentError(name, expected=expected, actual=repr(plant.states[i].start))
         spread[i] = np.std(log.values().observations[:, own[0]])
-    found = identify_from_outputs(mpc, log, function, start=0.5 * (low + high), start_spread=spread, seed=seed)
+    labels = [Label(output.name, output.unit) for output in plant.outputs]
+    known = {"start": 0.5 * (low + high), "start_spread": spread, "labels": labels}
+    found = identify_from_outputs(mpc, log, function, **known, seed=seed)
     return replace(found, table=_with_costs(plant, found, log.names[len(plant.outputs) :]))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mpcoffline.control.export import export_c
+from mpcoffline.control.loading import Acting
 from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidArgumentError
@@ -107,11 +108,11 @@ def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> 
 
     def written() -> dict[str, Any]:
         kept = judgement["verdict"] == KEEP
-        policy = MPCPolicy(order.mpc) if kept else learner.policy
+        acting = MPCPolicy(order.mpc) if kept else learner.policy
+        policy: Acting = acting
         if learner.sensors is not None:
-            observer = learner.sensors.suited(policy.mpc, order.table).observer(policy.mpc)
-            OutputFeedbackPolicy(policy, observer).save(path / POLICY)
-            return {"controller": None, "why_no_controller": "exported code has no observer, yet."}
+            observer = learner.sensors.suited(acting.mpc, order.table).observer(acting.mpc)
+            policy = OutputFeedbackPolicy(acting, observer)
         policy.save(path / POLICY)
         tell("Writing the controller as C99")
         try:

@@ -32,17 +32,19 @@ class DecisionLog:
     Args:
         path: The file.
         mpc: What acts, for names and units.
+        measured: Names and units of what is measured; by default those of the MPC's observations.
 
     Raises:
         StorageError: If the file is something else, of other columns, or cannot be written.
     """
 
-    def __init__(self, path: str | PathLike[str], mpc: MPC) -> None:
+    def __init__(self, path: str | PathLike[str], mpc: MPC, measured: Sequence[Label] | None = None) -> None:
         self._path, layout = Path(path), mpc.layout
         self._digits = _MILLISECONDS if mpc.model.dt >= _SLOW else 2 * _MILLISECONDS
         clocks = {column for signal in layout.signals if signal.period is not None for column in signal.columns}
         later = {column for signal in layout.signals for column in signal.columns[1:]}
-        self._values = [label for label in layout.y_labels if label.name not in clocks | later]
+        measured = layout.y_labels if measured is None else measured
+        self._values = [label for label in measured if label.name not in clocks | later]
         self._inputs = list(layout.u_labels)
         wanted = [Label(f"wanted {label.name}", label.unit) for label in self._inputs]
         labels = (*self._values, *self._inputs)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from mpcoffline.control.course import Course
-from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.control.loading import Acting
+from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError, UnknownIdError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc.signals import turned
-from mpcoffline.solvers import Plan
 
+from .carried import Carried
 from .clock import Clock, SystemClock
 from .decisions import DecisionLog
 from .device import Device, Measurement
@@ -88,6 +88,8 @@ class Service:
     * Past inputs that the MPC's state holds are those that were applied, not those that were wanted. Whether inputs act
       that the device has not confirmed nobody knows: the log leaves them empty, and what the device says is in effect
       at the next measurement counts.
+    * The observer of a policy that sees outputs knows what was applied, goes on where a measurement is lost, and does
+      without a single output as long as there is another one.
 
     Example:
         >>> service = Service(policy, LineDevice("127.0.0.1", 5020), fallback={"power": 0.0}, log=log)
@@ -112,7 +114,7 @@ class Service:
 
     def __init__(
         self,
-        policy: MPCPolicy,
+        policy: Acting,
         device: Device,
         *,
         period: float | None = None,
@@ -125,6 +127,7 @@ class Service:
         tell: Callable[[str], None] | None = None,
     ) -> None:
         mpc, layout = policy.mpc, policy.mpc.layout
+        labels = policy.y_labels
         self.period = float(mpc.model.dt if period is None else period)
         check_number("period", self.period, 0.0)
         check_integers(0, hold=hold)
@@ -133,14 +136,14 @@ class Service:
         check_number("deadline", self.deadline, 0.0, self.period)
         self._low, self._high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
         self._names, self._signals = [label.name for label in layout.u_labels], layout.signals
-        self._columns = [label.name for label in layout.y_labels]
+        self._columns = [label.name for label in labels]
+        self._may_lack = policy.observer.n_outputs if isinstance(policy, OutputFeedbackPolicy) else 0
         self._fallback = self._given(fallback or {})
-        self._policy, self._device, self._layout = policy, device, layout
+        self._policy, self._device, self._carried = policy, device, Carried(policy)
         self._hold, self._transfer, self._log = hold, transfer, log
         self._clock: Clock = SystemClock() if clock is None else clock
         self._tell = tell or (lambda _: None)
         self.stats = ServiceStats()
-        self._plan, self._memory = Plan.none(1, mpc), layout.filled(mpc.usual_input)
         self._applied = np.array(mpc.usual_input, dtype=np.float64)
         self._taken_over = self._wrong = self._unsure = False
         self._without = self._blended = 0
@@ -174,8 +177,8 @@ class Service:
                 over = math.floor((self._clock.now() - begin) / self.period + 1e-9)
                 passed = int(min(max(0, over - k - 1), end - k - 1))
                 self.stats.skipped += passed
-                for _ in range(passed if self._layout.n_memory else 0):
-                    self._memory = self._layout.remembered(self._memory, self._applied)
+                for _ in range(passed):
+                    self._carried.passed(self._applied)
                 k += 1 + passed
         except BaseException:  # whatever it is: nobody is in charge from here on
             last = np.where(np.isnan(self._fallback), self._applied, self._fallback)
@@ -195,8 +198,7 @@ class Service:
             note = "; ".join(filter(None, [note, refused]))
         else:
             self._applied, self._unsure = decision.inputs, False
-        if self._layout.n_memory:
-            self._memory = self._layout.remembered(self._memory, self._applied)
+        self._carried.passed(self._applied)
         late = self._clock.now() - begin
         self.stats.periods += 1
         self.stats.longest = max(self.stats.longest, late)
@@ -223,10 +225,7 @@ class Service:
         solves = self._policy.solver_stats
         at_hand, without, started = solves.n_best_plan + solves.n_previous_plan, solves.n_zero, self._clock.now()
         y = np.array([values[name] for name in self._columns])
-        memory = self._memory[None]
-        state: Any = self._plan
-        if self._layout.n_memory:
-            state = Course(self._plan.x, self._plan.u, memory, self._plan.multipliers)
+        state = self._carried.state(y)
         try:
             wanted, following = self._clock.call("policy", lambda: self._policy.predict(y, state=state), until)
         except TimeoutError:
@@ -239,8 +238,7 @@ class Service:
         if solves.n_zero > without or not np.isfinite(wanted).all():
             self.stats.failed += 1
             return values, self._instead("no plan was found"), solving
-        least = 3 if isinstance(following, Course) else 2
-        self._plan = Plan(*following[:2], *following[least:])
+        self._carried.decided(following)
         approximate = solves.n_best_plan + solves.n_previous_plan > at_hand
         self.stats.approximate += approximate
         return values, self._blend(np.asarray(wanted, dtype=np.float64), approximate), solving
@@ -270,14 +268,12 @@ class Service:
         """The inputs in effect when the first measurement comes, as far as the device knows them."""
         self._taken_over = True
         self._applied = self._in_effect(measured)
-        self._memory = self._layout.filled(self._applied)
+        self._carried.take_over(self._applied)
 
     def _corrected(self, measured: Measurement) -> None:
         """The same after inputs that the device has not confirmed: perhaps it did take them."""
         self._applied = self._in_effect(measured)
-        inputs, ages = self._layout.ages
-        newest = ages == 1
-        self._memory[newest] = self._applied[inputs[newest]]
+        self._carried.correct(self._applied)
 
     def _in_effect(self, measured: Measurement) -> Array:
         """The inputs that the device says are in effect, within their bounds; those that it does not say as before."""
@@ -302,11 +298,15 @@ class Service:
             for column in later:
                 found.setdefault(column, found.get(first, math.nan))
                 first = column
-        for name in self._columns:
-            if not math.isfinite(found.get(name, math.nan)):
-                actual = "none" if name not in found else str(found[name])
-                raise InvalidArgumentError(name, expected="a number", actual=actual)
-        return {name: found[name] for name in self._columns}
+        lost = [name for name in self._columns if not math.isfinite(found.get(name, math.nan))]
+        outputs = self._columns[: self._may_lack]
+        if not set(outputs) <= set(lost):  # others tell of the states, too
+            lost = [name for name in lost if name not in outputs]
+        for name in lost:
+            actual = "none" if name not in found else str(found[name])
+            raise InvalidArgumentError(name, expected="a number", actual=actual)
+        told = {name: found.get(name, math.nan) for name in self._columns}
+        return {name: value if math.isfinite(value) else math.nan for name, value in told.items()}
 
     def _write(self, inputs: Array, until: float) -> str | None:
         """Hands inputs to the device; says why, where it does not take them."""

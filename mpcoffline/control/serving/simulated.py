@@ -10,6 +10,7 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.labels import Label
 
 from .clock import Clock
 from .device import Measurement
@@ -28,6 +29,7 @@ class SimulatedDevice:
         inputs: Those in effect at first, by name; the usual ones by default.
         watchdog: Steps after which, without a new input, the first ones are back; None for never.
         seed: Of the environment.
+        measured: Names of what the environment shows; by default those of the MPC's observations.
 
     Raises:
         InvalidArgumentError: For an environment of other sizes than the MPC's.
@@ -43,12 +45,14 @@ class SimulatedDevice:
         inputs: Mapping[str, float] | None = None,
         watchdog: int | None = None,
         seed: int = 0,
+        measured: Sequence[Label] | None = None,
     ) -> None:
-        self._names: Sequence[str] = [label.name for label in mpc.layout.y_labels]
+        labels = mpc.layout.y_labels if measured is None else measured
+        self._names: Sequence[str] = [label.name for label in labels]
         self._inputs: Sequence[str] = [label.name for label in mpc.layout.u_labels]
         sizes = env.observation_space.shape, env.action_space.shape
-        if sizes != ((mpc.ny,), (mpc.nu,)):
-            expected = f"{mpc.ny} observations and {mpc.nu} inputs, as the policy has"
+        if sizes != ((len(labels),), (mpc.nu,)):
+            expected = f"{len(labels)} observations and {mpc.nu} inputs, as the policy has"
             raise InvalidArgumentError("environment", expected=expected, actual=f"shapes {sizes[0]} and {sizes[1]}")
         self._env, self._clock, self._watchdog = env, clock, watchdog
         self._period = float(mpc.model.dt if period is None else period)

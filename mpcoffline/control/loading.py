@@ -1,0 +1,30 @@
+"""A policy from its file, whichever kind it is."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+from mpcoffline.core.archive import holds, with_ending
+
+from .output_feedback import OutputFeedbackPolicy
+from .policy import MPCPolicy
+
+#: What acts on measurements: of the plant's states, or of its outputs.
+Acting = MPCPolicy | OutputFeedbackPolicy
+
+
+def load_policy(path: str | PathLike[str], **solver_options: Any) -> Acting:
+    """The policy in a file of :meth:`MPCPolicy.save`, :meth:`OutputFeedbackPolicy.save` or of a learner.
+
+    Args:
+        path: The file, with or without ``.zip``.
+        **solver_options: See :meth:`MPCPolicy.load`.
+
+    Raises:
+        FileFormatError: If the file is damaged, foreign or of another version.
+        InvalidArgumentError: For an option that the solver has not.
+        MPCOfflineError: For a learner that has not learned.
+    """
+    kind = OutputFeedbackPolicy if holds(with_ending(path), "output_feedback") else MPCPolicy
+    return kind.load(path, **solver_options)
