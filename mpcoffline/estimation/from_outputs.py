@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from mpcoffline.mpc.labels import Label
 from mpcoffline.mpc.scaling import Scaling
 
 from .observer import KalmanObserver, OutputModel, Outputs
+from .output_delays import Fit, search_delays
 from .output_episodes import (
     OutputEpisodes,
     OutputPoint,
@@ -46,9 +48,9 @@ _WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of 
 _FARTHEST = 10.0  # logarithms of noise from where it begins: beyond, numbers end
 _STEP = 1e-4  # of differences
 _UNKNOWN = 0.5  # of the prior's standard deviation: what is left so wide was not told by the log
-_AHEAD = 15  # steps, as models of the log are judged by
-_NOTHING = 0.7  # of what outputs move, missed: such a model says little more than that they stay
-_SAYS_NOTHING = (
+AHEAD = 15  #: Steps, as models of the log are judged by.
+NOTHING = 0.7  #: Of what outputs move, missed: such a model says little more than that they stay.
+_SAYSNOTHING = (
     "That is hardly better than to say that they stay: the model's structure may be wrong, an input unknown, or they"
     " move little more than their noise."
 )
@@ -64,7 +66,7 @@ class OutputIdentification:
         sensors: Outputs, their noise, what the model misses, where episodes begin; and of which parameters and states
             the log hardly says anything: these stay near what was given.
         names: Names of the parameters that were learned, ``(p,)``.
-        deviations: Their standard deviations, in logarithms for those above zero, ``(p,)``.
+        deviations: Their standard deviations, ``(p,)``; infinite for one of which nothing is known.
         seen: Share of each state's variance that outputs remove, of what there would be without them, ``(n_states,)``.
         missed: How far each output is from what was predicted 15 steps before, in what it moves in these,
             ``(n_outputs,)``; NaN where no episode is that long.
@@ -81,10 +83,14 @@ class OutputIdentification:
 
     def __str__(self) -> str:
         """What was found, in sentences."""
-        said = f"{self.sensors} Their model misses {listed(self.sensors.process)} a step."
+        said = f"{self.sensors} {self._late()}Their model misses {listed(self.sensors.process)} a step."
         if np.isfinite(self.missed).all():
-            said += f" {_AHEAD} steps ahead, outputs are missed by {listed(100.0 * self.missed)} % of what they move."
-        return f"{said} {_SAYS_NOTHING}" if (self.missed > _NOTHING).any() else said
+            said += f" {AHEAD} steps ahead, outputs are missed by {listed(100.0 * self.missed)} % of what they move."
+        return f"{said} {_SAYSNOTHING}" if (self.missed > NOTHING).any() else said
+
+    def _late(self) -> str:
+        delay = self.mpc.layout.delay
+        return f"Inputs act {', '.join(map(str, delay))} steps late. " if any(delay) else ""
 
 
 def identify_from_outputs(
@@ -95,6 +101,7 @@ def identify_from_outputs(
     start: ArrayLike | None = None,
     start_spread: ArrayLike,
     labels: Sequence[Label] = (),
+    late: Sequence[bool] | None = None,
     seed: int = 0,
 ) -> OutputIdentification:
     """Model parameters, noise and states from a log of outputs, by the largest likelihood of its innovations.
@@ -121,20 +128,24 @@ def identify_from_outputs(
         start_spread: How far they are from that, standard deviation, ``(n_states,)``: the scale of states that nobody
             has measured.
         labels: What the outputs are called, as :class:`KalmanObserver` takes them.
+        late: Which inputs may act later than the MPC says, ``(nu,)``: their dead time is looked for; none by default.
         seed: Picks rows and starts.
 
     Raises:
         InvalidArgumentError: For outputs of another number than the log's, or what :class:`KalmanObserver` refuses.
         InvalidDataError: If an output never moves, rows are few, or episodes too short to see a state in them.
     """
-    model = OutputModel(mpc, outputs)
     given = KalmanObserver(mpc, outputs, 1.0, 0.0, start=start, start_spread=start_spread, labels=labels)
-    data = output_episodes(mpc, log, model.n_outputs)
-    search = _Search(mpc, model, data.some(_ROWS, _LONGEST, seed), _first_start(given, data), given.start_spread, log)
+    data = output_episodes(mpc, log, given.n_outputs)
+    start, spread = _first_start(given, data), given.start_spread
+    model = OutputModel(mpc, outputs)
+    search = _Search(mpc, model, data.some(_ROWS, _LONGEST, seed), start, spread, log)
     if len(log) < _ROWS_A_NUMBER * search.size:
         expected = f"{_ROWS_A_NUMBER * search.size} rows at least, to find {search.size} numbers in"
         raise InvalidDataError("log", expected=expected, actual=str(len(log)))
     v = search.best(seed)
+    if any(late or ()) or any(mpc.layout.delay):
+        mpc, data, search, v = _with_delay(mpc, late or (), search, log, v, seed)
     found, curvature = search.found(v), search.curvature(v)
     p = search.coordinates.size
     variances = np.diag(np.linalg.pinv(curvature))[:p]
@@ -146,12 +157,26 @@ def identify_from_outputs(
     unknown += [f"{mpc.layout.y_labels[i]} (a state)" for i in np.flatnonzero(seen < _SEEN)]
     parts = found.noise, found.process, found.start, given.start_spread
     sensors = Sensors(model.function, *parts, undetermined=tuple(unknown), labels=given.labels)
-    deviations = wide * np.where(search.coordinates.logarithmic, 1.0, search.coordinates.scale)
+    values = identified.theta[search.coordinates.mask]
+    deviations = wide * np.where(search.coordinates.logarithmic, values, search.coordinates.scale)
     table = with_states(log, states, data, model.n_outputs)
-    missed = missed_ahead(model, data, found, given.start_spread, _AHEAD)
+    missed = missed_ahead(model, data, found, given.start_spread, AHEAD)
     result = OutputIdentification(identified, sensors, names, deviations, seen, missed, table)
-    (_log.warning if unknown or (missed > _NOTHING).any() else _log.info)("%s", result)
+    (_log.warning if unknown or (missed > NOTHING).any() else _log.info)("%s", result)
     return result
+
+
+def missed_of(mpc: MPC, sensors: Sensors, log: TransitionTable) -> Array:
+    """How far an MPC's model misses outputs 15 steps ahead, as :attr:`OutputIdentification.missed`, on some rows.
+
+    Args:
+        mpc: Its model may be a rough one.
+        sensors: Outputs and noise; suited to the model (:meth:`Sensors.suited`).
+        log: Transitions of outputs.
+    """
+    data = output_episodes(mpc, log, sensors.n_outputs).some(_ROWS, _LONGEST, 0)
+    known = OutputPoint(mpc.theta, sensors.noise, sensors.process, sensors.start)
+    return missed_ahead(OutputModel(mpc, sensors.outputs), data, known, sensors.start_spread, AHEAD)
 
 
 class _Search:
@@ -187,9 +212,18 @@ class _Search:
         )
 
     @property
+    def n_outputs(self) -> int:
+        """How many outputs there are."""
+        return self._model.n_outputs
+
+    @property
     def size(self) -> int:
         """How many coordinates there are."""
         return len(self._widths)
+
+    def missed(self, v: Array) -> Array:
+        """How far outputs are missed some steps ahead, see :func:`missed_ahead`."""
+        return missed_ahead(self._model, self._data, self.found(v), self._spread, AHEAD)
 
     def found(self, v: Array) -> OutputPoint:
         """What a point ``(..., size)`` is in units."""
@@ -219,10 +253,10 @@ class _Search:
         away = np.concatenate([np.full(self.coordinates.size, _AWAY), np.zeros(size - self.coordinates.size)])
         starts = [np.zeros(size), *(away * rng.standard_normal(size) for _ in range(_STARTS - 1))]
         starts[0][: self.coordinates.size] = self.coordinates.start
-        tried = [self._descended(np.clip(v, self._bounds.lb, self._bounds.ub), _FIRST_ITERATIONS) for v in starts]
-        return self._settled(self._descended(min(tried, key=lambda each: each[1])[0], _ITERATIONS)[0])
+        tried = [self.descended(np.clip(v, self._bounds.lb, self._bounds.ub), _FIRST_ITERATIONS) for v in starts]
+        return self.settled(self.descended(min(tried, key=lambda each: each[1])[0], _ITERATIONS)[0])
 
-    def _settled(self, v: Array) -> Array:
+    def settled(self, v: Array) -> Array:
         """The minimum near v by Newton's method: along narrow valleys, where parameters are told apart by little.
 
         Curvatures count by their size, and are found again where a step had to be shortened.
@@ -250,7 +284,14 @@ class _Search:
                 curved = None
         return v
 
-    def _descended(self, v: Array, iterations: int) -> tuple[Array, float]:
+    def on(self, data: OutputEpisodes) -> _Search:
+        """The same on other rows."""
+        other = copy.copy(self)
+        other._data = data
+        return other
+
+    def descended(self, v: Array, iterations: int) -> tuple[Array, float]:
+        """Some way down from a point: where, and the loss there."""
         done = scipy.optimize.minimize(
             self._with_slope, v, jac=True, method="L-BFGS-B", bounds=self._bounds, options={"maxiter": iterations}
         )
@@ -268,6 +309,33 @@ class _Search:
         for (i, j), value in zip(pairs, second, strict=True):
             found[i, j] = found[j, i] = value
         return found
+
+
+def _with_delay(
+    mpc: MPC, late: Sequence[bool], search: _Search, log: TransitionTable, v: Array, seed: int
+) -> tuple[MPC, OutputEpisodes, _Search, Array]:
+    """The MPC with the dead time of the log, its episodes, the search on them, and the likeliest point.
+
+    What was applied before an episode, and acts in it, is taken for what makes outputs likelier.
+    """
+    tried = {}
+
+    def fitted(delay: tuple[int, ...], point: Array | None) -> Fit:
+        begin, each = v if point is None else point, []
+        for held in (False, True)[: 1 + any(delay)]:
+            data = output_episodes(mpc.with_delay(delay), log, search.n_outputs, held=held)
+            each.append((data, search.on(data.some(_ROWS, _LONGEST, seed))))
+        losses = [float(own.loss(begin[None])[0]) for _, own in each]
+        chosen = int(np.argmin(losses))
+        own, at, loss = each[chosen][1], begin, losses[chosen]
+        if point is not None or chosen:
+            at, loss = own.descended(begin, _FIRST_ITERATIONS)
+        tried[delay] = each[chosen]
+        return Fit(loss, at, float(np.sqrt(np.mean(own.missed(at) ** 2))))
+
+    delay, best = search_delays(mpc, late, int(log.episodes.lengths.max()), fitted)
+    data, own = tried[delay]
+    return mpc.with_delay(delay), data, own, v if np.array_equal(best.point, v) else own.settled(best.point)
 
 
 def _first_start(given: KalmanObserver, data: OutputEpisodes) -> Array:

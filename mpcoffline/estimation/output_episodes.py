@@ -64,8 +64,15 @@ class OutputEpisodes(NamedTuple):
         return OutputEpisodes(y, self.acting[:T, chosen], lengths[chosen], self.rows[chosen])
 
 
-def output_episodes(mpc: MPC, log: TransitionTable, n_outputs: int) -> OutputEpisodes:
+def output_episodes(mpc: MPC, log: TransitionTable, n_outputs: int, *, held: bool = False) -> OutputEpisodes:
     """The episodes of a log whose observations are outputs, then signals.
+
+    Args:
+        mpc: Has the dead time of each input.
+        log: The log.
+        n_outputs: How many there are.
+        held: Whether inputs before an episode, which act in it where there is dead time, were its first ones: as after
+            a gap. The usual ones by default: as after a standstill.
 
     Raises:
         InvalidArgumentError: For another number of columns.
@@ -102,7 +109,8 @@ def output_episodes(mpc: MPC, log: TransitionTable, n_outputs: int) -> OutputEpi
         y[:length, e] = columns.observations[rows, :n_outputs]
         y[length, e] = columns.next_observations[first + length - 1, :n_outputs]
         for i, delay in enumerate(layout.delay):
-            late = np.concatenate([np.full(delay, usual[i]), columns.actions[rows, i]])[:length]
+            before = columns.actions[first, i] if held else usual[i]
+            late = np.concatenate([np.full(delay, before), columns.actions[rows, i]])[:length]
             acting[:length, e, i] = late
         present = layout.present - layout.n_states + n_outputs
         acting[:length, e, layout.nu :] = columns.observations[rows][:, present]

@@ -136,6 +136,7 @@ def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentific
         spread[i] = np.std(log.values().observations[:, own[0]])
     labels = [Label(output.name, output.unit) for output in plant.outputs]
     known = {"start": 0.5 * (low + high), "start_spread": spread, "labels": labels}
+    known["late"] = [each.delay is None for each in plant.inputs]
     found = identify_from_outputs(mpc, log, function, **known, seed=seed)
     return replace(found, table=_with_costs(plant, found, log.names[len(plant.outputs) :]))
 

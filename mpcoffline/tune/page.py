@@ -7,7 +7,7 @@ from typing import Literal
 
 from mpcoffline.core.notebook import html_of
 from mpcoffline.core.tables import Table
-from mpcoffline.estimation import DelaySearch, Identification
+from mpcoffline.estimation import DelaySearch, Identification, OutputIdentification
 
 from .experiment import Experiment
 
@@ -42,7 +42,8 @@ class LogCheck:
         head: What was read.
         remarks: What was found, problems first.
         tables: Coverage, parameters and predictions.
-        identification: The model of the log; None where none could be found.
+        identification: The model of the log; None where none could be found, or outputs are measured.
+        outputs: What was found in a log of outputs; None where states are measured.
         delays: What the log says of dead time.
         experiments: What would determine the parameters that the log leaves open.
     """
@@ -51,6 +52,7 @@ class LogCheck:
     remarks: list[Remark] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     identification: Identification | None = None
+    outputs: OutputIdentification | None = None
     delays: DelaySearch | None = None
     experiments: dict[str, Experiment | None] = field(default_factory=dict)
 

@@ -45,8 +45,8 @@ def tune(
     * ``log.zip`` and ``plant.json``, from which ``retune`` goes on without running the plant file again;
     * ``run.json``, options, versions, hashes, verdict and expected costs.
 
-    Of a plant with outputs, model and states are found in these first (:meth:`mpcoffline.Plant.identify`), in place of
-    the check; the policy has its observer, there is no C code, and ``retune`` does not know such folders, yet.
+    Of a plant with outputs, model and states are found in these first (:meth:`mpcoffline.Plant.identify`); the policy
+    and its C code have their observer.
 
     Example:
         >>> plant = mpcoffline.load_plant("two_tank.py")
@@ -82,7 +82,7 @@ def tune(
     if place.begin():
         tell(f"Going on with {place.path}")
 
-    def checked() -> dict[str, Any]:
+    def checked() -> LogCheck:
         tell("Checking log and description")
         found = check_log(plant, table, seed=options["seed"], tell=lambda what: tell(f"  {what}"))
         forbidding = [each for each in found.remarks if each.forbids]
@@ -93,17 +93,16 @@ def tune(
                 actual=" ".join(f"{each.about}: {each.text}" for each in forbidding),
                 hint="`mpcoffline check` shows all that was found.",
             )
-        return _said(found)
-
-    def estimated() -> dict[str, Any]:
-        return {"verdict": f"The log holds outputs. {outputs}", "remarks": []}
+        return found
 
     outputs = None
-    if plant.outputs:
-        tell("Finding model and states in the outputs")
-        outputs = plant.identify(table, seed=options["seed"])
+    if plant.outputs:  # what is found in them is needed below, also where the rest is there
+        found = checked()
+        outputs = found.outputs
         tell(f"  {outputs}")
-    said = place.once("check", estimated if plant.outputs else checked)
+        said = place.once("check", lambda: _said(found))
+    else:
+        said = place.once("check", lambda: _said(checked()))
     for each in said["remarks"]:
         if each["kind"] == "problem":
             tell(f"To be looked at: {each['about']}: {each['text']}")

@@ -15,9 +15,9 @@ from mpcoffline.cli import app
 from mpcoffline.cli.own_plants import _show
 from mpcoffline.core.tables import Table
 from mpcoffline.tune import LogCheck, check_log
+from mpcoffline.tune.covered import gain
 from mpcoffline.tune.determined import _long
 from mpcoffline.tune.experiment import experiments
-from mpcoffline.tune.log_check import _gain
 
 pytest.importorskip("polars")
 
@@ -77,10 +77,10 @@ def test_times_have_as_many_digits_as_they_deserve(seconds: float, words: str) -
 
 def test_the_verdict_claims_no_more_than_is_known() -> None:
     begin = "Worth tuning. Ten steps ahead, the described model is 3.0 times"
-    assert _gain(0.9, 0.3, 0.01).startswith(begin)
-    assert _gain(0.05, 0.05, 0.0).startswith("Nothing speaks against tuning. The described parameters predict")
-    assert _gain(0.4, 0.38, 0.25).startswith("Nothing speaks against")  # noise makes most of it
-    poor = _gain(0.62, 0.55, 0.01)
+    assert gain(0.9, 0.3, 0.01).startswith(begin)
+    assert gain(0.05, 0.05, 0.0).startswith("Nothing speaks against tuning. The described parameters predict")
+    assert gain(0.4, 0.38, 0.25).startswith("Nothing speaks against")  # noise makes most of it
+    poor = gain(0.62, 0.55, 0.01)
     assert poor.startswith("Tuning may gain little.")
     assert "miss by 62% of the spread and 55%, of which the sensors' noise makes 1%" in poor
 

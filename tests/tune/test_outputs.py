@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mpcoffline import InvalidArgumentError, load_plant
+from mpcoffline import InvalidArgumentError, TransitionTable, load_plant
 from mpcoffline.cli import app
 from mpcoffline.control import OutputFeedbackPolicy
-from mpcoffline.tune import Tuned, retune
+from mpcoffline.tune import LogCheck, Tuned, check_log, retune
 
 pytest.importorskip("polars")
 
@@ -65,8 +65,8 @@ def test_from_a_log_of_outputs_to_a_policy_on_outputs(files: tuple[Path, Path], 
     out = tmp_path / "tuned"
     done = CliRunner().invoke(app, ["tune", str(plant), str(log), "--out", str(out), "--preset", "fast"])
     assert done.exit_code == 0, done.output
-    assert "Finding model and states in the outputs" in done.output
-    assert "has no observer" in done.output
+    assert "model and states, in the outputs" in done.output
+    assert {each.name for each in (out / "controller").iterdir()} >= {"mpc_observer.c", "mpc_controller.c"}
     tuned = Tuned.load(out)
     assert tuned.verdict in ("recommend", "try with care")
     assert tuned.learner.mpc.values["model.k"] == pytest.approx(0.07, rel=0.1)
@@ -91,7 +91,62 @@ def test_from_a_log_of_outputs_to_a_policy_on_outputs(files: tuple[Path, Path], 
 
 def test_what_needs_states_says_so(files: tuple[Path, Path]) -> None:
     plant, log = files
-    for command in ("check", "learn"):
-        done = CliRunner().invoke(app, [command, str(plant), str(log)])
-        assert done.exit_code != 0
-        assert f"expected states that are measured, for {command}" in done.output
+    done = CliRunner().invoke(app, ["learn", str(plant), str(log)])
+    assert done.exit_code != 0
+    assert "expected states that are measured, for learn" in done.output
+
+
+def rows_of(log: Path) -> tuple[str, list[list[float]]]:
+    head, *lines = log.read_text().splitlines()
+    return head, [[float(cell) for cell in line.split(",")] for line in lines]
+
+
+def written(path: Path, head: str, rows: list[list[float]]) -> Path:
+    path.write_text("\n".join([head, *(",".join(map(repr, row)) for row in rows)]))
+    return path
+
+
+def about(found: LogCheck, kind: str, what: str) -> str:
+    return " ".join(each.text for each in found.remarks if (each.kind, each.about) == (kind, what))
+
+
+def test_a_sound_log_of_outputs_gives_no_alarm(files: tuple[Path, Path]) -> None:
+    plant, log = files
+    done = CliRunner().invoke(app, ["check", str(plant), str(log)])
+    assert done.exit_code == 0, done.output
+    assert done.output.startswith("Worth tuning. 15 steps ahead, the described model is")
+    assert "the log determines all 2" in done.output
+    assert "dead time: none" in done.output
+    assert "Write delay" not in done.output
+    assert "States that are estimated" in done.output
+
+
+def test_what_is_wrong_with_a_log_of_outputs_is_named(files: tuple[Path, Path], tmp_path: Path) -> None:
+    """A unit, an input that does nothing, an output that is stuck: without a model, where that would only mislead."""
+    plant, (head, rows) = load_plant(files[0]), rows_of(files[1])
+    unit = written(tmp_path / "unit.csv", head, [[t, 3.0 * y, u] for t, y, u in rows])
+    assert "episodes begin with gauge at" in about(
+        check_log(plant, plant.read(unit)), "problem", "description and data"
+    )
+    still = written(tmp_path / "still.csv", head, [[t, y, 3.0] for t, y, _ in rows])
+    assert "pump is one number throughout" in about(check_log(plant, plant.read(still)), "problem", "inputs")
+    c, ids = plant.read(files[1]).values(), plant.read(files[1]).episode_ids
+    beyond = TransitionTable.from_arrays(
+        c.observations, 10 * c.actions, c.costs, c.next_observations, c.terminations, ids
+    )
+    found = check_log(plant, beyond)
+    assert [each.about for each in found.remarks if each.forbids] == ["identification"]
+    assert found.outputs is None
+
+
+def test_dead_time_is_found_in_outputs(files: tuple[Path, Path], tmp_path: Path) -> None:
+    """The pump's inputs moved three rows back in each episode of 41: it acts three steps late."""
+    plant, (head, rows) = load_plant(files[0]), rows_of(files[1])
+    for first in range(0, len(rows), 41):
+        applied = [row[2] for row in rows[first : first + 41]]
+        for row, u in zip(rows[first : first + 41], [*applied[3:], *applied[-1:] * 3], strict=True):
+            row[2] = u
+    found = check_log(plant, plant.read(written(tmp_path / "late.csv", head, rows)))
+    assert "pump acts 3 steps late. Write delay=3" in about(found, "advice", "dead time")
+    assert found.outputs is not None
+    assert found.outputs.mpc.layout.delay == (3,)
