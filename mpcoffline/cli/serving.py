@@ -122,8 +122,7 @@ def serve(
         say(f"Log: [bold]{escape(str(log))}[/]")
         folder = policy.parent
         if (folder / "run.json").is_file():
-            others = " --where decided_by=policy" if stats.decided < stats.periods else ""
-            say(f"Next: mpcoffline retune {escape(str(folder))} {escape(str(log))}{others}")
+            say(f"Next: mpcoffline retune {escape(str(folder))} {escape(str(log))}")
 
 
 def _numbers(given: dict[str, str]) -> dict[str, float]:

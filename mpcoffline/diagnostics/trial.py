@@ -15,7 +15,7 @@ from mpcoffline.core.text import figure
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import Identification
+from mpcoffline.estimation import Identification, Sensors
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
@@ -217,11 +217,14 @@ def compared(
     found, clean = identify_as_logged(nominal, table, rows, seed=seed, start=learner.start)
     policies = {TRIED: quick_policy(running), FIRST: quick_policy(given)}
     slow = are_slow(policies.values())
-    around, starts = _surroundings(learned, given, (log, table, clean), tried, found, slow, seed + _TRIAL)
+    around, starts = _surroundings(
+        learned, given, (log, table, clean), tried, found, slow, seed + _TRIAL, sensors=learner.sensors
+    )
     own = np.ones(len(table), dtype=bool) if today is None else np.asarray(table.episode_ids) < today
     clone = Behaviour.of(table.take(np.flatnonzero(own)) if own.any() else table, layout, seed)
     n, votes, steps = len(starts), around.models.votes, around.n_steps
-    controllers: dict[str, Controller] = {**policies, TODAY: clone}
+    controllers: dict[str, Controller] = {name: around.seeing(policy) for name, policy in policies.items()}
+    controllers[TODAY] = clone
     levels = _levels(around, clone, table, votes, own)
     predicted = {
         name: stretched(_band(episodes.cost[votes].reshape(int(votes.sum()), -1, n), levels), widened)
@@ -232,7 +235,8 @@ def compared(
     if expected is not None and np.isfinite(expected[0]).all():
         low, middle, high = (float(v) * steps / expected[1] for v in expected[0])
         promised = low, middle, high
-    return Calibration(steps, n, seen, predicted, promised, int(votes.sum()), _others(running, tried), widened)
+    others = 0.0 if learner.sensors is not None else _others(running, tried)  # what was estimated then nobody logged
+    return Calibration(steps, n, seen, predicted, promised, int(votes.sum()), others, widened)
 
 
 def widening(trials: Iterable[tuple[float | None, float]]) -> float:
@@ -266,6 +270,7 @@ def _surroundings(
     found: Identification,
     slow: bool,
     seed: int,
+    sensors: Sensors | None,
 ) -> tuple[Surroundings, NDArray[np.intp]]:
     """Models of the log, begun where stretches of the trial do, several times each; and where these begin.
 
@@ -273,7 +278,7 @@ def _surroundings(
     """
     log, table, clean = logs
     loops = _FEW_LOOPS if slow else _LOOPS
-    usual = surroundings_of(learned, given, log, found, slow=slow, n_starts=1, seed=seed)
+    usual = surroundings_of(learned, given, log, found, slow=slow, n_starts=1, seed=seed, sensors=sensors)
     rng, longest = np.random.default_rng(seed), int(table.episodes.lengths.max())
     steps = min(usual.n_steps + usual.n_before, longest, int(tried.episodes.lengths.max()))
     starts = _stretches(tried, steps, min(_WINDOWS, loops // 2))
@@ -281,12 +286,15 @@ def _surroundings(
     _, firsts, lengths = table.episodes
     whole = np.concatenate([np.arange(a, a + n - steps + 1) for a, n in zip(firsts, lengths, strict=True)])
     rows = rng.choice(whole, size=times * len(starts), replace=len(whole) < times * len(starts))
-    around = Surroundings(usual.models, usual.cost, clean, rows, steps, learned.layout, seed, logged=table)
+    around = Surroundings(
+        usual.models, usual.cost, clean, rows, steps, learned.layout, seed, logged=table, sensors=sensors
+    )
     states = np.tile(tried.values().observations[starts], (times, 1))
     n, noise = learned.layout.n_states, usual.models.noise  # of the sensors: where a stretch began is not known exactly
     states[:, :n] += noise * rng.standard_normal((len(states), n))
     signals = signals_along(tried, starts, steps, learned.layout)
-    return around.begun_at(states, np.tile(signals, (times, 1, 1))), starts
+    at_work = np.tile(~np.isin(starts, tried.episodes.firsts), times)
+    return around.begun_at(states, np.tile(signals, (times, 1, 1)), at_work), starts
 
 
 def _stretches(trial: TransitionTable, steps: int, most: int) -> NDArray[np.intp]:

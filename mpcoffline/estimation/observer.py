@@ -25,6 +25,7 @@ Outputs = Sequence[int] | Callable[[ca.SX], Any]
 
 _SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
 _MANY = 500  # points, from which on torch, an operation at a time, is faster than CasADi, a point at a time
+_AT_WORK = 50  # steps, after which covariances hardly change any more
 _RANDOM_WALK = 1e3  # steps, over which a disturbance of an unbounded input would have come about
 
 
@@ -222,6 +223,21 @@ class KalmanObserver:
             spread = np.append(spread, np.where(np.isfinite(width), _SHARE * width, unbounded))
         x = np.append(self.start, np.zeros(self.n_disturbances))
         return Estimate(np.tile(x, (n_loops, 1)), np.tile(np.diag(spread**2), (n_loops, 1, 1)))
+
+    def at_work(self, x: Array, acting: Array) -> Estimate:
+        """What is known at states x ``(B, n_states)`` before an output, after many steps: linearised there.
+
+        Args:
+            x: The states.
+            acting: What acts there, as :meth:`ahead` takes it.
+        """
+        known = self.begin(len(x))
+        known.x[:, : x.shape[1]] = x
+        seen = self._model.seen(known.x)
+        for _ in range(_AT_WORK):
+            P = self.corrected(known, seen).P
+            known = Estimate(known.x, self.ahead(Estimate(known.x, P), acting).P)
+        return known
 
     def ahead(self, known: Estimate, acting: Array) -> Estimate:
         """What is known a step later, before an output.

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import casadi as ca
 import numpy as np
 
 from mpcoffline.core.checks import check_number
-from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC
+from mpcoffline.mpc.expressions import function_from_json, function_to_json
 from mpcoffline.mpc.labels import Label
 
 from .calling import called, number
@@ -118,45 +120,118 @@ def outputs_function(plant: Plant) -> ca.Function:
 
 def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentification:
     """See :meth:`mpcoffline.Plant.identify`."""
-    from mpcoffline.estimation import identify_from_outputs  # a second, which reading a log need not wait for
-
     if not plant.outputs:
         hint = "Where the states themselves are measured, a learner takes the log as it is."
         raise InvalidArgumentError("outputs", expected="a plant with outputs", actual="none", hint=hint)
-    mpc, function = plant.mpc(), outputs_function(plant)
-    log.check_fits(mpc.ny - mpc.layout.n_states + len(plant.outputs), mpc.nu, *plant.action_bounds)
-    low, high = np.array([state.starts for state in plant.states]).T
-    spread = (high - low) / np.sqrt(12.0)
-    for i in np.flatnonzero(spread == 0.0).tolist():
-        own = [k for k, output in enumerate(plant.outputs) if output.of == plant.states[i].name]
-        if not own:
-            expected = "a range (low, high): how far it may be from there when an episode begins, as nobody measures it"
-            name = f"state {plant.states[i].name}: start"
-            raise InvalidArgumentError(name, expected=expected, actual=repr(plant.states[i].start))
-        spread[i] = np.std(log.values().observations[:, own[0]])
-    labels = [Label(output.name, output.unit) for output in plant.outputs]
-    known = {"start": 0.5 * (low + high), "start_spread": spread, "labels": labels}
-    known["late"] = [each.delay is None for each in plant.inputs]
-    found = identify_from_outputs(mpc, log, function, **known, seed=seed)
-    return replace(found, table=_with_costs(plant, found, log.names[len(plant.outputs) :]))
+    return OutputReader.of(plant).identify(plant.mpc(), log, seed)
 
 
-def _with_costs(plant: Plant, found: OutputIdentification, names: tuple[str, ...]) -> TransitionTable:
-    """Transitions with what the plant's cost says of their states, as the log of outputs could not tell it."""
-    columns, layout, n = found.table.values(), found.mpc.layout, len(plant.states)
-    first = np.zeros(len(found.table), dtype=bool)
-    first[found.table.episodes.firsts] = True
-    inputs: Array = columns.actions
-    before = np.where(first[:, None], inputs, np.roll(inputs, 1, axis=0))
-    states, present = columns.observations[:, :n], columns.observations[:, layout.present.tolist()]
-    costs = plant.costs(states, inputs, present, before)
-    table = TransitionTable.from_arrays(
-        columns.observations, inputs, costs, columns.next_observations, columns.terminations, found.table.episode_ids
-    )
-    if names:
-        own = (f"{state.name} [{state.unit}]" if state.unit else state.name for state in plant.states)
-        table.names = (*own, *names)
-    return table
+@dataclass(frozen=True)
+class OutputReader:
+    """How a log of outputs becomes one of states: all that it takes of a plant, as a file has it, too.
+
+    Attributes:
+        outputs: h, states ``(n_states, 1)`` -> outputs.
+        cost: Of a step: states, inputs, present signals and the inputs before -> cost.
+        labels: What the outputs are called, ``(n_outputs,)``.
+        starts: Between which values states are where an episode begins, ``(n_states, 2)``.
+        places: Which output each state is, ``(n_states,)``; None for one that nobody measures.
+        late: Which inputs may act later than the MPC says, ``(nu,)``.
+    """
+
+    outputs: ca.Function
+    cost: ca.Function
+    labels: tuple[Label, ...]
+    starts: tuple[tuple[float, float], ...]
+    places: tuple[int | None, ...]
+    late: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, plant: Plant) -> Self:
+        """That of a plant with outputs."""
+        own = {output.of: k for k, output in reversed(list(enumerate(plant.outputs))) if isinstance(output.of, str)}
+        labels = tuple(Label(output.name, output.unit) for output in plant.outputs)
+        starts = tuple((float(low), float(high)) for low, high in (state.starts for state in plant.states))
+        places = tuple(own.get(state.name) for state in plant.states)
+        late = tuple(each.delay is None for each in plant.inputs)
+        return cls(plant.outputs_function, plant.cost_function, labels, starts, places, late)
+
+    def identify(self, mpc: MPC, log: TransitionTable, seed: int) -> OutputIdentification:
+        """Model, noise and states, with what a step costs of these; ``mpc`` is MPC_1."""
+        from mpcoffline.estimation import identify_from_outputs  # a second, which reading a log need not wait for
+
+        layout = mpc.layout
+        bounds = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
+        log.check_fits(mpc.ny - layout.n_states + len(self.labels), mpc.nu, *bounds)
+        low, high = np.array(self.starts).T
+        spread = (high - low) / np.sqrt(12.0)
+        for i in np.flatnonzero(spread == 0.0).tolist():
+            place = self.places[i]
+            if place is None:
+                expected = (
+                    "a range (low, high): how far it may be from there when an episode begins, as nobody measures it"
+                )
+                name = f"state {layout.y_labels[i].name}: start"
+                raise InvalidArgumentError(name, expected=expected, actual=repr(self.starts[i][0]))
+            spread[i] = np.std(log.values().observations[:, place])
+        known = {"start": 0.5 * (low + high), "start_spread": spread, "labels": self.labels, "late": self.late}
+        found = identify_from_outputs(mpc, log, self.outputs, **known, seed=seed)
+        return replace(found, table=self._with_costs(found, log.names[len(self.labels) :]))
+
+    def _with_costs(self, found: OutputIdentification, names: tuple[str, ...]) -> TransitionTable:
+        """Transitions with what a step costs of their states, as the log of outputs could not tell it."""
+        columns, layout = found.table.values(), found.mpc.layout
+        first = np.zeros(len(found.table), dtype=bool)
+        first[found.table.episodes.firsts] = True
+        inputs: Array = columns.actions
+        before = np.where(first[:, None], inputs, np.roll(inputs, 1, axis=0))
+        s = columns.observations[:, : layout.n_states], inputs, columns.observations[:, layout.present.tolist()], before
+        costs = self.cost(*(each.T for each in s)).full().ravel()
+        table = TransitionTable.from_arrays(
+            columns.observations,
+            inputs,
+            costs,
+            columns.next_observations,
+            columns.terminations,
+            found.table.episode_ids,
+        )
+        if names:
+            table.names = (*(str(label) for label in layout.y_labels[: layout.n_states]), *names)
+        return table
+
+    def to_json(self) -> dict[str, Any]:
+        """For a file.
+
+        Raises:
+            InvalidArgumentError: For outputs or a cost that are no plain arithmetic.
+        """
+        functions = {"outputs": function_to_json(self.outputs), "cost": function_to_json(self.cost)}
+        rest = {name: list(getattr(self, name)) for name in ("places", "late")}
+        pairs = {name: [list(each) for each in getattr(self, name)] for name in ("labels", "starts")}
+        return functions | rest | pairs
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], mpc: MPC) -> Self:
+        """The inverse, for an MPC of the plant.
+
+        Raises:
+            FileFormatError: For parts that do not fit together.
+            KeyError: For a part that is missing.
+            TypeError: For a part of another kind.
+            ValueError: Likewise.
+        """
+        layout = mpc.layout
+        n, nu = layout.n_states, layout.nu
+        labels = tuple(Label(str(name), str(unit)) for name, unit in data["labels"])
+        starts = tuple((float(low), float(high)) for low, high in data["starts"])
+        places = tuple(None if k is None else range(len(labels))[int(k)] for k in data["places"])
+        late = tuple(bool(each) for each in data["late"])
+        if (len(starts), len(places), len(late)) != (n, n, nu):
+            sizes = f"{len(starts)} starts, {len(places)} places, {len(late)} inputs"
+            raise FileFormatError("outputs", expected=f"those of {n} states and {nu} inputs", actual=sizes)
+        outputs = function_from_json(data["outputs"], "outputs", inputs=(n,), output=len(labels))
+        cost = function_from_json(data["cost"], "cost", inputs=(n, nu, len(layout.signals), nu), output=1)
+        return cls(outputs, cost, labels, starts, places, late)
 
 
 def check_measured(plant: Plant, what: str) -> None:

@@ -245,6 +245,7 @@ class Surroundings:
         paid = table if cost.limits is None else cost.limits.whole(table)
         self.returns = returns_along(paid, rows, n_steps) + self.before
         self.begun = np.isin(rows, table.episodes.firsts)
+        self.at_work = np.zeros(len(rows), dtype=bool)
         states = columns.observations
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
@@ -260,7 +261,7 @@ class Surroundings:
     def reordered(self, order: NDArray[np.intp]) -> Surroundings:
         """The same with its starts in another order, ``(starts,)``."""
         other = copy.copy(self)
-        for name in ("rows", "before", "starts", "signals", "returns", "begun"):
+        for name in ("rows", "before", "starts", "signals", "returns", "begun", "at_work"):
             setattr(other, name, getattr(self, name)[order])
         other.disturbances, other.noise = self.disturbances[:, order], self.noise[:, order]
         if self.sensors is not None:
@@ -273,15 +274,17 @@ class Surroundings:
             return policy
         return OutputFeedbackPolicy(policy, self.sensors.suited(policy.mpc, self.table).observer(policy.mpc))
 
-    def begun_at(self, starts: Array, signals: Array) -> Surroundings:
+    def begun_at(self, starts: Array, signals: Array, at_work: NDArray[np.bool_] | None = None) -> Surroundings:
         """The same models and disturbances from other starts, under other signals.
 
         Args:
             starts: States of the models, ``(starts, nx)``, as many as there are.
             signals: One after each step, ``(starts, n_steps, ny - n_states)``.
+            at_work: At which of these observers have been at work for long, ``(starts,)``; nowhere by default.
         """
         other = copy.copy(self)
         other.starts, other.signals, other.fresh = starts, signals, False
+        other.at_work = np.zeros(len(starts), dtype=bool) if at_work is None else at_work
         return other
 
     def act(self, controllers: Sequence[Controller], starts: slice = slice(None), kept: int = 0) -> list[Episodes]:
@@ -303,7 +306,7 @@ class Surroundings:
         lost, over, good = (np.zeros(shape, dtype=bool) for _ in range(3))
         total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
         states_kept, actions_kept = [x[:, :, :kept].copy()], []
-        courses = [self._course(controller, x[:, i], self.begun[starts]) for i, controller in enumerate(controllers)]
+        courses = [self._course(controller, x[:, i], starts) for i, controller in enumerate(controllers)]
         for k in range(self.n_steps):
             seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
             seen[..., :n] += noise[k]
@@ -348,15 +351,38 @@ class Surroundings:
         n, ny = self._layout.n_states, self._layout.ny
         return np.concatenate([self.sensors.seen(x[..., :n]) + self.output_noise[k, starts], x[..., n:ny]], axis=-1)
 
-    def _course(self, controller: Controller, x: Array, begun: NDArray[np.bool_]) -> Course | None:
-        """What a controller knows of the time before.
+    def _course(self, controller: Controller, x: Array, starts: slice) -> tuple[NDArray[Any], ...] | None:
+        """What a controller knows of the time before, at states ``(models, starts, nx)``.
 
         In midst of an episode it is the inputs that were applied; where one begins, what the controller takes for them.
         """
+        if isinstance(controller, OutputFeedbackPolicy):
+            return self._estimated(controller, x, self.at_work[starts])
         mpc, ny = getattr(controller, "mpc", None), self._layout.ny
-        if mpc is None or isinstance(controller, OutputFeedbackPolicy) or not mpc.nx == x.shape[2] > ny:
+        if mpc is None or not mpc.nx == x.shape[2] > ny:
             return None
-        fresh = begun[:, None] & self.fresh
+        fresh = self.begun[starts, None] & self.fresh
         past = np.where(fresh, mpc.layout.filled(mpc.usual_input), x[..., ny:]).reshape(-1, x.shape[2] - ny)
         plan = Plan.none(len(past), mpc)
         return Course(plan.x, plan.u, past, plan.multipliers)
+
+    def _estimated(
+        self, policy: OutputFeedbackPolicy, x: Array, at_work: NDArray[np.bool_]
+    ) -> tuple[NDArray[Any], ...] | None:
+        """What an observer knows of states ``(models, starts, nx)``: where it has been at work, nearly all."""
+        if not at_work.any():
+            return None
+        observer, mpc, n = policy.observer, policy.mpc, self._layout.n_states
+        flat, known = x.reshape(-1, x.shape[-1]), observer.begin(x.shape[0] * x.shape[1])
+        z = np.hstack([flat[:, : mpc.ny], np.tile(mpc.layout.filled(mpc.usual_input), (len(flat), 1))])
+        acting = mpc.layout.split(z, np.tile(mpc.usual_input, (len(flat), 1)))[1]
+        usual = observer.at_work(flat[:, :n], acting)
+        values, axes = np.linalg.eigh(usual.P)
+        drawn = np.sqrt(np.fmax(values, 0.0)) * np.random.default_rng(_NOISE).standard_normal(values.shape)
+        off, rows = np.einsum("bij,bj->bi", axes, drawn), np.tile(at_work, len(x))
+        known.x[rows], known.P[rows] = (usual.x + off)[rows], usual.P[rows]
+        plan: tuple[NDArray[Any], ...] = Plan.none(len(flat), mpc)
+        if mpc.layout.n_memory:
+            own = flat[:, mpc.ny :] if mpc.nx == flat.shape[1] else z[:, mpc.ny :]
+            plan = Course(plan[0], plan[1], np.where(rows[:, None], own, z[:, mpc.ny :]))
+        return (*known, np.full(acting.shape, np.nan), *plan)

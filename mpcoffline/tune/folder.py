@@ -24,6 +24,8 @@ RUN, PLANT, LOG, LEARNER, POLICY, PAGE = (
     "run.json", "plant.json", "log.zip", "learner.zip", "policy.zip", "report.html",
 )  # fmt: skip
 CODE, CHECKPOINT, BEGUN = "controller", "fit.ckpt", "begun.json"
+HIDDEN = "hidden"  # the part of plant.json that is about outputs
+OUTPUTS = "outputs.zip"  # what a log of outputs held, of which log.zip has the states
 _STEP = ".step.json"
 _FORMAT, _VERSION = "mpcoffline tuned", 1
 _PACKAGES = ("mpcoffline", "numpy", "scipy", "casadi", "torch")

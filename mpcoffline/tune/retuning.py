@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
+import numpy as np
+
+from mpcoffline.control.serving.decisions import DECIDED, DECIDED_BY
 from mpcoffline.core.archive import file_errors
 from mpcoffline.core.documents import read_json
-from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.datasets.logs.collecting import Options
 from mpcoffline.datasets.logs.reading import LoggedTable, read_log
 from mpcoffline.datasets.logs.sources import opened
 from mpcoffline.datasets.logs.wanted import Wanted
-from mpcoffline.datasets.table.files import hash_of
+from mpcoffline.datasets.table.files import hash_of, load_table, save_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
 from mpcoffline.diagnostics.trial import Band, Calibration, compared, widening
+from mpcoffline.mpc import MPC
+from mpcoffline.plants.outputs import OutputReader
 from mpcoffline.simulation.choice import FIRST
 
-from .folder import PLANT, RUN, Workplace, identity_of, read_run
+from .folder import HIDDEN, OUTPUTS, PLANT, RUN, Workplace, identity_of, read_run
 from .making import RUNNING, Order, Tell, made
 from .tuned import Tuned, item
 
@@ -72,18 +76,19 @@ def retune(
         folder: What :func:`tune` made.
         trial: The log of the trial: a file, a frame, or several.
         read: How it is read, as :meth:`mpcoffline.Plant.read` takes it; a log with the header of the first one is read
-            as that was, any other by the plant's names.
+            as that was, any other by the plant's names. Of a log of ``mpcoffline serve``, rows are left out in which
+            the policy took over or a fall-back acted, unless ``where`` says otherwise.
         tell: Is told, in a sentence, what is done now.
         show_progress: Whether the fit draws a progress bar.
 
     Raises:
         FileFormatError: If the folder is none of ``tune``, or damaged.
-        InvalidArgumentError: For a plant whose outputs are measured in place of its states.
         InvalidDataError: If the trial cannot be understood, or contradicts the description.
     """
     tell = tell or (lambda _: None)
     before = Tuned.load(folder)
-    reader, name = _reader(before)
+    learner = before.learner
+    reader, name, hidden = _reader(before, learner.nominal_mpc)
     table = read_log(trial, reader, _options(before, trial, read))
     tell(f"{len(table):,} control intervals of {reader.dt:g} s, {table.n_episodes} without a gap")
     sha, (options, expected, today, history) = hash_of(table), _of_before(before)
@@ -93,22 +98,32 @@ def retune(
     place = Workplace(before.folder, identity_of(before=before.document["identity"], trial=sha))
     if place.begin():
         tell(f"Going on with {place.path}")
-    learner, log, running = before.learner, before.table, before.policy.mpc
+    log, running, outputs = before.table, before.mpc, None
+    seen: TransitionTable = table
     today, before_widened = log.n_episodes if today is None else today, _widened(history)
+    if hidden is not None:
+        tell("Finding model and states in the outputs of both logs")
+        measured = load_table(before.folder / OUTPUTS)
+        every = TransitionTable.concat([measured, table])
+        save_table(every, place.path / OUTPUTS)
+        outputs = hidden.identify(learner.nominal_mpc, every, options["seed"])
+        tell(f"  {outputs}")
+        first = int(every.episode_ids[len(measured)])
+        seen = outputs.table.take(np.flatnonzero(np.asarray(outputs.table.episode_ids) >= first))
 
     def tried() -> dict[str, Any]:
         tell("Comparing the trial with what was predicted")
         how = {"expected": expected, "today": today, "seed": options["seed"], "widened": before_widened}
-        return compared(learner, running, log, table, **how).to_json()
+        return compared(learner, running, log, seen, **how).to_json()
 
     calibration = Calibration.from_json(place.once("trial", tried))
     history.append({"sha256": sha, "rows": len(table), "controller": before.document["policy"]} | calibration.to_json())
-    both = TransitionTable.concat([log, table])
+    both = TransitionTable.concat([log, table]) if outputs is None else outputs.table
     also = {} if before.document["policy"] == FIRST else {RUNNING: running}
     sections = [_section(calibration, history), _read_section(table)]
     reader_json, doubt = _reader_json(before), _DOUBT if calibration.far else ""
     how = also, sections, today, doubt, learner.mpc, _widened(history)
-    order = Order(name, reader_json, learner.nominal_mpc, both, options, *how)
+    order = Order(name, reader_json, learner.nominal_mpc, both, options, *how, outputs=outputs)
     document = made(order, place, tell, show_progress=show_progress)
     kept = {key: before.document[key] for key in ("check", "read") if key in before.document}
     document |= kept | {"trials": history, "today": today}
@@ -121,32 +136,31 @@ def _reader_json(before: Tuned) -> dict[str, Any]:
     return dict(read_json(before.folder / PLANT))
 
 
-def _reader(before: Tuned) -> tuple[Wanted, str]:
-    path = before.folder / PLANT
-    with file_errors(path):
+def _reader(before: Tuned, mpc: MPC) -> tuple[Wanted, str, OutputReader | None]:
+    """What reads logs, the plant's name, and what finds states in outputs; None where states are measured."""
+    with file_errors(before.folder / PLANT):
         data = _reader_json(before)
-        name = str(data["name"])
-        reader = None if "outputs" in data else Wanted.from_json(data)
-    if reader is None:
-        hint = "Tune anew with all logs: mpcoffline tune PLANT.py LOG TRIAL --out FOLDER."
-        actual = "outputs in place of these"
-        raise InvalidArgumentError(name, expected="states that are measured", actual=actual, hint=hint)
-    return reader, name
+        hidden = OutputReader.from_json(data[HIDDEN], mpc) if HIDDEN in data else None
+        return Wanted.from_json(data), str(data["name"]), hidden
 
 
 def _options(before: Tuned, trial: Any, read: Mapping[str, Any] | None) -> Options:
-    """As the first log was read, where the header is the same; else as is said, or by the plant's names."""
+    """As the first log was read, where the header is the same; else as is said, or by the plant's names.
+
+    In a log of ``serve``, rows count in which the policy was in charge, or what it had decided last was held.
+    """
     given = {name: value for name, value in (read or {}).items() if value}
-    stored = before.document.get("read")
-    if given or not stored:
-        return Options(**given)
     first = trial[0] if isinstance(trial, list | tuple) and trial else trial
     with opened(first) as source:
-        alike = list(source.header) == stored["header"]
-    if not alike:
-        return Options()
-    with file_errors(before.folder / RUN):
-        return Options(**stored["options"])
+        header = list(source.header)
+    stored = before.document.get("read")
+    options = Options(**given)
+    if not given and stored and header == stored["header"]:
+        with file_errors(before.folder / RUN):
+            options = Options(**stored["options"])
+    if DECIDED_BY in header and not options.where:
+        options = replace(options, where={DECIDED_BY: [DECIDED[0], DECIDED[2]]})
+    return options
 
 
 def _of_before(before: Tuned) -> tuple[dict[str, Any], tuple[Band, int], int | None, list[dict[str, Any]]]:

@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
+from mpcoffline.control.loading import load_policy
 from mpcoffline.control.output_feedback import OutputFeedbackPolicy
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.archive import file_errors
@@ -20,6 +21,7 @@ from mpcoffline.core.text import figure
 from mpcoffline.datasets.table.files import load_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learner.learner import OfflineMPCLearner
+from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST
 
 from .folder import LEARNER, LOG, PAGE, POLICY, RUN, read_run
@@ -83,6 +85,15 @@ class Tuned:
             FileFormatError: If it takes states, as :attr:`policy`, or is damaged.
         """
         return OutputFeedbackPolicy.load(self.folder / POLICY)
+
+    @property
+    def mpc(self) -> MPC:
+        """The MPC in ``policy.zip``, whatever it sees.
+
+        Raises:
+            FileFormatError: If the file is damaged.
+        """
+        return load_policy(self.folder / POLICY).mpc
 
     @property
     def learner(self) -> OfflineMPCLearner:

@@ -7,16 +7,18 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
+
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.tables import Table
 from mpcoffline.datasets.logs.reading import LoggedTable
-from mpcoffline.datasets.table.files import hash_of
+from mpcoffline.datasets.table.files import hash_of, save_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
-from mpcoffline.mpc.expressions import function_to_json
 from mpcoffline.plants import Plant
+from mpcoffline.plants.outputs import OutputReader
 
-from .folder import Workplace, identity_of, read_run
+from .folder import HIDDEN, OUTPUTS, Workplace, identity_of, read_run
 from .log_check import check_log
 from .making import Order, Tell, check_options, made
 from .page import LogCheck
@@ -101,6 +103,8 @@ def tune(
         outputs = found.outputs
         tell(f"  {outputs}")
         said = place.once("check", lambda: _said(found))
+        save_table(table, place.path / OUTPUTS)
+        save_table(table, place.path / OUTPUTS)
     else:
         said = place.once("check", lambda: _said(checked()))
     for each in said["remarks"]:
@@ -124,13 +128,9 @@ def _reader(plant: Plant) -> dict[str, Any]:
     """What reads logs of a plant, and what tells it from another."""
     if not plant.outputs:
         return {"name": plant.name} | plant.wanted.to_json(plant.cost_function)
-    shown = {"outputs": function_to_json(plant.outputs_function), "cost": function_to_json(plant.cost_function)}
-    return {
-        "name": plant.name,
-        "dt": float(plant.dt),
-        "starts": [list(state.starts) for state in plant.states],
-        **shown,
-    }
+    sizes = len(plant.outputs), len(plant.inputs), len(plant.signals), len(plant.inputs)
+    nothing = ca.Function("nothing", [ca.SX.sym(f"i{k}", n) for k, n in enumerate(sizes)], [ca.SX(0.0)])
+    return {"name": plant.name, HIDDEN: OutputReader.of(plant).to_json()} | plant.wanted.to_json(nothing)
 
 
 def _said(found: LogCheck) -> dict[str, Any]:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mpcoffline import InvalidArgumentError, TransitionTable, load_plant
+from mpcoffline import TransitionTable, load_plant
 from mpcoffline.cli import app
 from mpcoffline.control import OutputFeedbackPolicy
-from mpcoffline.tune import LogCheck, Tuned, check_log, retune
+from mpcoffline.tune import Calibration, LogCheck, Tuned, check_log
 
 pytest.importorskip("polars")
 
@@ -85,8 +85,21 @@ def test_from_a_log_of_outputs_to_a_policy_on_outputs(files: tuple[Path, Path], 
     assert "States are estimated from 1 output" in page
     again = CliRunner().invoke(app, ["tune", str(plant), str(log), "--out", str(out), "--preset", "fast"])
     assert "there already" in again.output
-    with pytest.raises(InvalidArgumentError, match="Tune anew with all logs"):
-        retune(out, log)
+    trial, truth = tmp_path / "trial.csv", plant.parent / "truth.py"
+    command = ["serve", str(out / "policy.zip"), "--simulate", str(truth), "--log", str(trial), "--periods", "120"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert done.output.startswith("120 periods, 120 decided by the policy")
+    done = CliRunner().invoke(app, ["retune", str(out), str(trial)])
+    assert done.exit_code == 0, done.output
+    assert "outputs of both logs" in done.output
+    calibration = Calibration.from_json(Tuned.load(out).document["trials"][-1])
+    assert calibration.known
+    assert not calibration.far, str(calibration)
+    after = Tuned.load(out)
+    assert after.table.n_episodes == tuned.table.n_episodes + 1
+    assert isinstance(after.output_policy, OutputFeedbackPolicy)
+    assert "learned from already" in CliRunner().invoke(app, ["retune", str(out), str(trial)]).output
 
 
 def test_what_needs_states_says_so(files: tuple[Path, Path]) -> None:

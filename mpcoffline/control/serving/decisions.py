@@ -18,6 +18,7 @@ from mpcoffline.mpc.labels import Label
 
 #: What decided: the policy, the policy with what ran before blended in, the input before, the fall-back input.
 DECIDED = ("policy", "transfer", "hold", "fallback")
+DECIDED_BY = "decided_by"  #: The column that says so.
 
 
 _MILLISECONDS, _SLOW = 3, 1.0  # digits of a second; seconds of a period for which they suffice
@@ -48,7 +49,7 @@ class DecisionLog:
         self._inputs = list(layout.u_labels)
         wanted = [Label(f"wanted {label.name}", label.unit) for label in self._inputs]
         labels = (*self._values, *self._inputs)
-        self._header = ["time", *map(str, (*labels, *wanted)), "decided_by", "late_s", "solve_s", "note"]
+        self._header = ["time", *map(str, (*labels, *wanted)), DECIDED_BY, "late_s", "solve_s", "note"]
         try:
             exists = self._path.exists()
             if exists:
