@@ -18,23 +18,43 @@ app = typer.Typer()
 _MARKS = {"ok": "[green]ok[/]  ", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
 
 
-@app.command(epilog=examples("mpcoffline export learner_policy.zip --out controller/"))
+class Target(StrEnum):
+    """What a policy is written for."""
+
+    c = "c"
+    do_mpc = "do-mpc"
+
+
+@app.command(
+    epilog=examples(
+        "mpcoffline export learner_policy.zip --out controller/",
+        "mpcoffline export learner_policy.zip --to do-mpc --out controller/",
+    )
+)
 def export(
     policy: Controller,
-    out: Annotated[Path, typer.Option(help="Folder for the C files.", file_okay=False)] = Path("controller"),
+    to: Annotated[Target, typer.Option(help="C99, or a script for do-mpc.")] = Target.c,
+    out: Annotated[Path, typer.Option(help="Folder for the files.", file_okay=False)] = Path("controller"),
 ) -> None:
     """Write a policy as self-contained C99: no allocation, no dependency, a fixed budget of iterations.
 
     The folder receives the controller, a header with names and units of the parameters, a CMake file, and a test that
-    compares it with this package's solutions.
+    compares it with this package's solutions. A policy that sees outputs comes with its observer.
+
+    With `--to do-mpc`: a script for do-mpc that makes the same controller, and its functions as CasADi's files.
     """
     controller = loaded_policy(policy)
-    with working("Writing C"):
-        from mpcoffline.control.export import export_c
+    with working(f"Writing {to.value}"):
+        if to is Target.c:
+            from mpcoffline.control.export import export_c
 
-        paths = export_c(controller, out)
+            paths = export_c(controller, out)
+        else:
+            from mpcoffline.control.export_do_mpc import export_do_mpc
+
+            paths = export_do_mpc(controller, out)
     for path in paths:
-        say_file("C", path)
+        say_file(to.value, path)
 
 
 class Waste(StrEnum):
