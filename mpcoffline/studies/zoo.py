@@ -190,6 +190,16 @@ class Outcome:
         return self.full_over_behaviour > MARGIN * abs(self.behaviour)
 
     @property
+    def under_today(self) -> bool:
+        """Whether the learned MPC costs less than these, by more than 2 %."""
+        return self.over_behaviour < -MARGIN * abs(self.behaviour)
+
+    @property
+    def full_under_today(self) -> bool:
+        """Whether the whole fit does."""
+        return self.full_over_behaviour < -MARGIN * abs(self.behaviour)
+
+    @property
     def violates_more(self) -> bool:
         """Whether the learned MPC violates limits in more steps than MPC_1, beyond two standard errors."""
         return self.more_over > 2.0 * self.more_over_error

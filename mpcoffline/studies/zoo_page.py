@@ -132,6 +132,11 @@ def _of_verdicts(rows: Sequence[Outcome]) -> list[str]:
         better = [o for o in rows if (o.full_better if full else o.better)]
         return f"**{sum(recommended(o, full) for o in better)} of {len(better)}**"
 
+    def right_today(full: bool) -> str:
+        better = [o for o in rows if (o.full_better if full else o.better)]
+        better = [o for o in better if (o.full_under_today if full else o.under_today)]
+        return f"**{sum(recommended(o, full) for o in better)} of {len(better)}**"
+
     def over(full: bool) -> str:
         found = [o for o in rows if recommended(o, full) and (o.full_over_today if full else o.over_today)]
         return f"**{len(found)}**" + _names(found)
@@ -145,6 +150,7 @@ def _of_verdicts(rows: Sequence[Outcome]) -> list[str]:
     lines = [
         f"* Recommended, but worse than MPC_1 by more than 2 %: {both(wrong)}",
         f"* Better than MPC_1 by more than 2 % and recommended: {both(right)}",
+        f"* Better than the controllers of the log by more than 2 %, too, and recommended: {both(right_today)}",
         f"* Recommended, but worse than the controllers of the log by more than 2 %: {both(over)}",
         f"* Worse than these by more than 2 %, and the verdict says so: {both(warned)}",
     ]

@@ -158,18 +158,22 @@ def test_verdicts_are_counted_against_the_truth() -> None:
         ),
         judged(105.0, 130.0, 2, "recommend", "recommend"),
         judged(120.0, 99.0, 3, "keep MPC_1", "keep MPC_1", warned=1.0),
+        judged(
+            95.0, 95.0, 4, "try with care", "keep MPC_1", behaviour=96.0, over_behaviour=-1.0, full_over_behaviour=-1.0
+        ),
     ]
     page = zoo_page.report(rows)
     assert (
         "Recommended, but worse than MPC_1 by more than 2 %: handed out **1** (cart 2), whole fit **1** (cart 2)"
         in page
     )
-    assert "and recommended: handed out **1 of 2**, whole fit **1 of 1**" in page
+    assert "MPC_1 by more than 2 % and recommended: handed out **1 of 3**, whole fit **1 of 2**" in page
+    assert "more than 2 %, too, and recommended: handed out **1 of 2**, whole fit **1 of 1**" in page  # without cart 4
     assert "worse than the controllers of the log by more than 2 %: handed out **0**, whole fit **1** (cart 2)" in page
     assert "and the verdict says so: handed out **1 of 1**, whole fit **2 of 2**" in page
     assert "median deviation **7.6%**" in page
     assert "within the report's own band 1 of 2" in page
-    assert "worse than MPC_1 by more than 2 % in 2 of 4; better in 1, what was handed out in 2" in page
+    assert "worse than MPC_1 by more than 2 % in 2 of 5; better in 2, what was handed out in 3" in page
     assert "verdict 3 to 3 (median 3); with fit 23 to 23" in page
     assert "52 (45 to 60)" in page
     assert "recommend: why" in page
