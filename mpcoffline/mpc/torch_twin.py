@@ -116,11 +116,31 @@ class TorchTwin:
             operands = sources[:1] if op in _UNARY else sources
             places = list(operands) if op == ca.OP_INPUT else [latest[source] for source in operands]
             latest[targets[0]] = len(self._program)
-            self._program.append((op, places, constant))
+            self._program.append(self._folded(op, places, constant))
+        self._constants = [constant if op == ca.OP_CONST else None for op, _, constant in self._program]
+        self._calls = [call for k in range(len(self._program)) if (call := self._call(k)) is not None]
+        self._reads = [(k, *places) for k, (op, places, _) in enumerate(self._program) if op == ca.OP_INPUT]
         self._branches = any(op == ca.OP_IF_ELSE_ZERO for op, *_ in self._program)
         self._layers: Layered | None = None
         if len(self._program) > _LARGE and not self._branches:
             self._layers = layered(function)
+
+    def _folded(self, op: int, places: list[int], constant: float) -> tuple[int, list[int], float]:
+        """The instruction; the number that it gives where all operands are numbers."""
+        known = [self._program[place] for place in places] if op not in (ca.OP_CONST, ca.OP_INPUT) else []
+        if not known or any(each[0] != ca.OP_CONST for each in known):
+            return op, places, constant
+        operands: list[_Scalar] = [torch.tensor(each[2], dtype=torch.float64) for each in known]
+        return ca.OP_CONST, [], float(_applied(op, operands, torch.zeros((), dtype=torch.float64)))
+
+    def _call(self, k: int) -> tuple[int, Callable[..., Any], int, int | None, bool] | None:
+        """Place, function, places of one or two operands, and whether it takes numbers; None for no operation."""
+        op, places, _ = self._program[k]
+        if op in (ca.OP_CONST, ca.OP_INPUT):
+            return None
+        if op in _UNARY:
+            return k, _UNARY[op], places[0], None, False
+        return k, _BINARY[op], places[0], places[1], op in _ARITHMETIC
 
     def __call__(self, *inputs: Tensor) -> Tensor:
         """Evaluates the function.
@@ -158,18 +178,17 @@ class TorchTwin:
     def _replayed(
         self, columns: Sequence[Sequence[Tensor]], like: Tensor, needed: Sequence[_Mask] | None
     ) -> list[_Scalar]:
-        """The result of every instruction."""
-        work: list[_Scalar] = []
-        for k, (op, places, constant) in enumerate(self._program):
-            if op == ca.OP_CONST:
-                work.append(constant)
-            elif op == ca.OP_INPUT:
-                work.append(columns[places[0]][places[1]])
-            else:
-                operands = [work[place] for place in places]
-                if needed is not None and isinstance(needed[k], Tensor):
-                    operands = [_cut(operand, needed[k]) for operand in operands]
-                work.append(_applied(op, operands, like))
+        """The result of every instruction; with ``needed``, without gradients where they are not."""
+        work: list[Any] = list(self._constants)
+        for k, i, j in self._reads:
+            work[k] = columns[i][j]
+        for k, function, a, b, takes_numbers in self._calls:
+            operands = [work[a]] if b is None else [work[a], work[b]]
+            if needed is not None and isinstance(needed[k], Tensor):
+                operands = [_cut(operand, needed[k]) for operand in operands]
+            if b is not None and not takes_numbers:
+                operands = [_tensor(operand, like) for operand in operands]
+            work[k] = function(*operands)
         return work
 
     def _needed(self, work: Sequence[_Scalar]) -> list[_Mask]:
