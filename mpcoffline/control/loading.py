@@ -15,11 +15,11 @@ Acting = MPCPolicy | OutputFeedbackPolicy
 
 
 def load_policy(path: str | PathLike[str], **solver_options: Any) -> Acting:
-    """The policy in a file of :meth:`MPCPolicy.save`, :meth:`OutputFeedbackPolicy.save` or of a learner.
+    """The policy in a file of :meth:`mpcoffline.MPCPolicy.save`, of :class:`~mpcoffline.control.OutputFeedbackPolicy` or of a learner.
 
     Args:
         path: The file, with or without ``.zip``.
-        **solver_options: See :meth:`MPCPolicy.load`.
+        **solver_options: See :meth:`mpcoffline.MPCPolicy.load`.
 
     Raises:
         FileFormatError: If the file is damaged, foreign or of another version.
