@@ -15,7 +15,7 @@ Acting = MPCPolicy | OutputFeedbackPolicy
 
 
 def load_policy(path: str | PathLike[str], **solver_options: Any) -> Acting:
-    """The policy in a file of :meth:`mpcoffline.MPCPolicy.save`, of :class:`~mpcoffline.control.OutputFeedbackPolicy` or of a learner.
+    """The policy in a file of a policy or a learner, whether it sees states or outputs.
 
     Args:
         path: The file, with or without ``.zip``.
