@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
+from mpcoffline.core.threads import one_blas_thread
 from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, OutputIdentification
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 _FRESH = 1_000  # added to the seed: other models and starts than those of the choice
 
 
+@one_blas_thread()
 def diagnose(
     learner: OfflineMPCLearner,
     dataset: MinariDataset | TransitionTable | OutputIdentification | str,

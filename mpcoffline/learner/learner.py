@@ -19,6 +19,7 @@ from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.notebook import html_of
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
+from mpcoffline.core.threads import one_blas_thread
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import OutputIdentification, Sensors
 from mpcoffline.estimation.consistency import check
@@ -288,7 +289,7 @@ class OfflineMPCLearner:
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
         history: History = [] if saved is None else saved.resume(run)
-        with ExitStack() as ending, Bars(show_progress) as bars:
+        with ExitStack() as ending, Bars(show_progress) as bars, one_blas_thread():
             for callback in callbacks:
                 if (end := getattr(callback, "on_fit_end", None)) is not None:
                     ending.callback(end)

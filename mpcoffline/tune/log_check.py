@@ -30,6 +30,7 @@ _WELL, _POOR = 0.2, 0.5  # of the spread, ten steps ahead
 _TREND, _SURE = 0.05, 5.0  # of the errors' variance, and standard errors
 
 
+@one_blas_thread()
 def check_log(
     plant: Plant, table: TransitionTable, *, seed: int = 0, tell: Callable[[str], None] = lambda _: None
 ) -> LogCheck:
