@@ -8,6 +8,7 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.tables import Table
+from mpcoffline.core.threads import one_blas_thread
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import find_delays, identify
