@@ -50,7 +50,7 @@ _STEP = 1e-4  # of differences
 _UNKNOWN = 0.5  # of the prior's standard deviation: what is left so wide was not told by the log
 AHEAD = 15  #: Steps, as models of the log are judged by.
 NOTHING = 0.7  #: Of what outputs move, missed: such a model says little more than that they stay.
-_SAYSNOTHING = (
+_SAYS_NOTHING = (
     "That is hardly better than to say that they stay: the model's structure may be wrong, an input unknown, or they"
     " move little more than their noise."
 )
@@ -86,7 +86,7 @@ class OutputIdentification:
         said = f"{self.sensors} {self._late()}Their model misses {listed(self.sensors.process)} a step."
         if np.isfinite(self.missed).all():
             said += f" {AHEAD} steps ahead, outputs are missed by {listed(100.0 * self.missed)} % of what they move."
-        return f"{said} {_SAYSNOTHING}" if (self.missed > NOTHING).any() else said
+        return f"{said} {_SAYS_NOTHING}" if (self.missed > NOTHING).any() else said
 
     def _late(self) -> str:
         delay = self.mpc.layout.delay

@@ -129,6 +129,28 @@ def test_it_knows_the_state_through_transfer_silence_and_a_lost_sensor(delay: in
     assert stats.decided == 45
 
 
+def test_inputs_that_were_taken_but_not_confirmed_count_as_the_device_says() -> None:
+    plant = plant_of()
+    policy = policy_of(plant)
+    clock, device, env = lab(policy, plant)
+
+    class Deaf(Failing):
+        """It takes every input; of some it says nothing."""
+
+        def write(self, inputs: Mapping[str, float]) -> None:
+            super().write(inputs)
+            if 5 <= self.n < 12:
+                raise TimeoutError("no answer")
+
+    service = Service(policy, Deaf(device, range(0), {}), clock=clock, transfer=1)
+    for k in range(16):
+        service.run(1)
+        if k == 15:
+            np.testing.assert_allclose(states_of(policy, service), env.state[:2], atol=0.1)
+        clock.advance(DT)
+    assert service.stats.unwritten == 7
+
+
 def test_the_log_has_the_outputs(tmp_path: Path) -> None:
     plant = plant_of()
     policy = policy_of(plant)

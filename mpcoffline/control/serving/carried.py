@@ -66,3 +66,6 @@ class Carried:
         inputs, ages = self._layout.ages
         newest = ages == 1
         self._memory[newest] = applied[inputs[newest]]
+        if np.isfinite(self._acting).all():
+            acts_at_once = np.flatnonzero(np.array(self._layout.delay) == 0)
+            self._acting[0, acts_at_once] = applied[acts_at_once]
