@@ -38,7 +38,7 @@ def rows_of(text: str, wanted: dict[str, Any]) -> tuple[list[str], Rows]:
         ValueError: If the page has no such table or column.
     """
     if wanted.get("shares"):
-        return ["share"], {what: [int(a) / int(b)] for what, a, b in _SHARE.findall(text)}
+        return ["share"], {what: [int(a) / int(b)] for what, a, b in _SHARE.findall(text.partition("\n## ")[0])}
     begin = text.index(wanted["after"]) if "after" in wanted else 0
     header, *lines = _table(text[begin:])
     if column := wanted.get("counts"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import time
 from collections.abc import Iterator
@@ -67,20 +66,24 @@ def test_a_lost_worker_costs_no_job_and_a_deadly_job_is_named(kind: str, tmp_pat
         parallel.map(os._exit, {"dies": 3, "too": 3}, 2, executor=kind)
 
 
-def test_a_worker_that_dies_while_jobs_are_handed_out_costs_no_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Joblib tells of a worker lost to the first job where it hands out the second."""
+def test_a_worker_that_dies_while_jobs_are_handed_out_costs_no_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Joblib tells of a worker that the first job has lost where it hands out the second: that waits for it here."""
     joblib = pytest.importorskip("joblib")
-    process_executor = importlib.import_module("joblib.externals.loky.process_executor")
     submit, calls = joblib.parallel.LokyBackend.submit, []
 
-    def dies_once(self: Any, *args: Any, **kwargs: Any) -> Any:
+    def late(self: Any, *args: Any, **kwargs: Any) -> Any:
         calls.append(self)
-        if len(calls) == 2:
-            raise process_executor.TerminatedWorkerError("the first worker is gone")
+        until = time.monotonic() + 30.0
+        while len(calls) == 2 and self._workers._flags.broken is None and time.monotonic() < until:
+            time.sleep(0.01)
         return submit(self, *args, **kwargs)
 
-    monkeypatch.setattr(joblib.parallel.LokyBackend, "submit", dies_once)
-    assert parallel.map(abs, [-1, -2, -3], 2, executor="joblib") == [1, 2, 3]
+    mark = str(tmp_path / "mark")
+    once = f"__import__('os').path.exists({mark!r}) or (open({mark!r}, 'w').close(), __import__('os')._exit(9))"
+    monkeypatch.setattr(joblib.parallel.LokyBackend, "submit", late)
+    assert parallel.map(eval, {"dies once": once, "b": "2", "c": "3"}, 2, executor="joblib") == [True, 2, 3]
     assert len(calls) == 5
 
 
