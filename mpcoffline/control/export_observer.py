@@ -15,7 +15,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.text import c_comment
 from mpcoffline.core.types import Array
-from mpcoffline.estimation.observer import KalmanObserver
+from mpcoffline.estimation.observer import KalmanObserver, disturbed_plant
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.ddp.codegen import text
 from mpcoffline.solvers.ddp.elimination import value_and_jacobian
@@ -102,14 +102,8 @@ def _source(observer: KalmanObserver, mpc: MPC) -> str:
 
 def _functions(observer: KalmanObserver, mpc: MPC) -> str:
     """The model with its disturbances, the outputs, and the Jacobians of both, column by column."""
-    n, m = mpc.layout.n_states, observer.n_disturbances
-    z, acting, theta = (
-        ca.SX.sym("z", n + m),
-        ca.SX.sym("acting", len(mpc.layout.acting)),
-        ca.SX.sym("theta", mpc.space.size),
-    )
-    disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
-    reached = ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:])
+    n = mpc.layout.n_states
+    (z, acting, theta), reached = disturbed_plant(mpc, observer.n_disturbances)
     check_limit("mpc", "operations of a model", ca.n_nodes(reached), limits.COMPILED_NODES, error=InvalidArgumentError)
     value, slope = value_and_jacobian(reached, z, ca.vertcat(acting, theta))
     seen, seen_slope = value_and_jacobian(observer.function(z[:n]), z, ca.SX.sym("none", 0))

@@ -54,7 +54,7 @@ _SAYS_NOTHING = (
     "That is hardly better than to say that they stay: the model's structure may be wrong, an input unknown, or they"
     " move little more than their noise."
 )
-_SEEN = 0.5  # share of a state's variance that outputs have to remove
+SEEN = 0.5  #: Share of a state's variance that outputs have to remove.
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def identify_from_outputs(
     unknown = [n for n, d in zip(names, wide, strict=True) if d > _UNKNOWN * _WIDTHS["parameters"]]
     identified = mpc.with_theta(canonical(mpc, found.theta))
     states, seen = smoothed_states(model, data, found, given.start_spread)
-    unknown += [f"{mpc.layout.y_labels[i]} (a state)" for i in np.flatnonzero(seen < _SEEN)]
+    unknown += [f"{mpc.layout.y_labels[i]} (a state)" for i in np.flatnonzero(seen < SEEN)]
     parts = found.noise, found.process, found.start, given.start_spread
     sensors = Sensors(model.function, *parts, undetermined=tuple(unknown), labels=given.labels)
     values = identified.theta[search.coordinates.mask]

@@ -41,6 +41,19 @@ class Estimate(NamedTuple):
     P: Array
 
 
+def disturbed_plant(mpc: MPC, n_disturbances: int) -> tuple[tuple[ca.SX, ca.SX, ca.SX], ca.SX]:
+    """``z+ = [f(x, u + d), d]`` for ``z = [x, d]``, with constant disturbances d of the first inputs.
+
+    Returns:
+        The symbols z ``(n_states + n_disturbances, 1)``, what acts ``(nu + n_signals, 1)`` and theta; and z+.
+    """
+    n, m = mpc.layout.n_states, n_disturbances
+    z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
+    theta = ca.SX.sym("theta", mpc.space.size)
+    disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
+    return (z, acting, theta), ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:])
+
+
 class OutputModel:
     """What an MPC's model says of outputs: the plant's map with constant disturbances of its inputs, and h.
 
@@ -58,16 +71,13 @@ class OutputModel:
     """
 
     def __init__(self, mpc: MPC, outputs: Outputs, n_disturbances: int = 0) -> None:
-        n, m = mpc.layout.n_states, n_disturbances
+        n = mpc.layout.n_states
         self.function = _outputs(outputs, n)
         self.n_outputs = self.function.numel_out(0)
-        z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
-        theta = ca.SX.sym("theta", mpc.space.size)
-        disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
-        ahead, seen = ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:]), self.function(z[:n])
+        (z, acting, theta), ahead = disturbed_plant(mpc, n_disturbances)
         self._ahead = _WithSlopes("ahead", [z, acting, theta], ahead)
-        self._seen = _WithSlopes("seen", [z], seen)
-        self._identity = np.eye(n + m)
+        self._seen = _WithSlopes("seen", [z], self.function(z[:n]))
+        self._identity = np.eye(z.numel())
 
     def ahead(self, known: Estimate, acting: Array, theta: Array, Q: Array) -> tuple[Estimate, Array]:
         """What is known a step later, before an output, and F ``(B, n, n)``.

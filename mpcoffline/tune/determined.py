@@ -17,8 +17,8 @@ from mpcoffline.plants import Plant
 from .experiment import Experiment, experiments
 from .page import Kind, LogCheck
 
-_DETERMINED, _WEAK = 0.1, 0.3  # relative deviation of a parameter
-_FAR, _SURE = 1.5, 3.0  # described spreads beyond which a parameter is far off, and deviations besides
+DETERMINED, WEAK = 0.1, 0.3  #: Relative deviation of a parameter.
+FAR, SURE = 1.5, 3.0  #: Described spreads beyond which a parameter is far off, and deviations besides.
 
 
 def parameters(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) -> None:
@@ -35,7 +35,7 @@ def parameters(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck) 
     ):
         relative = deviation / abs(value) if value else np.inf
         in_doubt = f"model.{name}" in left_open.split() or deviation == 0.0
-        word = "no" if in_doubt or relative > _WEAK else "weakly" if relative > _DETERMINED else "yes"
+        word = "no" if in_doubt or relative > WEAK else "weakly" if relative > DETERMINED else "yes"
         if f"model.{name}" in identified.at_bound:
             word = f"{word}, at its bound"
         rows.append((name, plant.parameters[name].unit, f"{before:.4g}", f"{value:.4g}", f"{deviation:.2g}", word))
@@ -73,7 +73,7 @@ def _far_off(plant: Plant, rows: Sequence[tuple[str, ...]], values: Array, devia
         given = plant.parameters[name]
         if not (word == "yes" and given.spread > 0.0 and given.value):
             continue
-        if abs(value - given.value) > _FAR * given.spread * abs(given.value) + _SURE * deviation:
+        if abs(value - given.value) > FAR * given.spread * abs(given.value) + SURE * deviation:
             far.append(
                 f"{name} is {value:.4g} {unit}".rstrip() + f" ({given.value:.4g} +- {given.spread:.0%} described)"
             )

@@ -11,18 +11,16 @@ from mpcoffline.core.tables import Table
 from mpcoffline.core.text import listed
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import OutputIdentification
-from mpcoffline.estimation.from_outputs import AHEAD, NOTHING, missed_of
+from mpcoffline.estimation.from_outputs import AHEAD, NOTHING, SEEN, missed_of
 from mpcoffline.mpc.labels import Label
 from mpcoffline.plants import Plant
 
 from .covered import coverage, gain, goal, quiet, readable, sampling
+from .determined import DETERMINED, FAR, SURE, WEAK
 from .page import LogCheck
 
-_DETERMINED, _WEAK = 0.1, 0.3  # relative deviation of a parameter
-_FAR, _SURE = 1.5, 3.0  # described spreads beyond which a parameter is far off, and deviations besides
 _STRANGE = 4.0  # standard deviations of where episodes begin, as described
 _LOST = 1e3  # of what an output moves: larger errors count as this
-_SEEN = 0.5  # share of a state's variance that outputs have to remove
 _NOISY = 0.9  # of what an output moves from step to step
 
 
@@ -94,8 +92,9 @@ def _dead_time(plant: Plant, known: OutputIdentification, found: LogCheck) -> No
         if each.delay is None and d:
             text = f"{each.name} acts {d} {'step' if d == 1 else 'steps'} late. Write delay={d} into the plant file"
             found.add("advice", "dead time", text)
-    if not any(known.mpc.layout.delay) and any(each.delay is None for each in plant.inputs):
-        found.add("good", "dead time", "none")
+    told = np.isfinite(known.missed).all()  # else episodes are too short to compare dead times in
+    if told and not any(known.mpc.layout.delay) and any(each.delay is None for each in plant.inputs):
+        found.add("good", "dead time", "none that shows")
 
 
 def _parameters(plant: Plant, known: OutputIdentification, found: LogCheck) -> None:
@@ -105,12 +104,12 @@ def _parameters(plant: Plant, known: OutputIdentification, found: LogCheck) -> N
         own, at = name.removeprefix("model."), given.space.names.index(name)
         before, value, parameter = float(given.theta[at]), float(known.mpc.theta[at]), plant.parameters[own]
         relative = deviation / abs(value) if value else np.inf
-        left_open = name in known.sensors.undetermined or relative > _WEAK
-        word = "no" if left_open else "weakly" if relative > _DETERMINED else "yes"
+        left_open = name in known.sensors.undetermined or relative > WEAK
+        word = "no" if left_open else "weakly" if relative > DETERMINED else "yes"
         rows.append((own, parameter.unit, f"{before:.4g}", f"{value:.4g}", f"{deviation:.2g}", word))
         if word == "no":
             open_ones.append(own)
-        elif parameter.spread > 0.0 and abs(value - before) > _FAR * parameter.spread * abs(before) + _SURE * deviation:
+        elif parameter.spread > 0.0 and abs(value - before) > FAR * parameter.spread * abs(before) + SURE * deviation:
             far.append(f"{own} is {value:.4g} {parameter.unit}".rstrip() + f" ({before:.4g} described)")
     if rows:
         header = ("parameter", "unit", "described", "in the log", "+-", "determined")
@@ -132,7 +131,7 @@ def _states(plant: Plant, known: OutputIdentification, found: LogCheck) -> None:
     rows = []
     for state, share, all_ in zip(plant.states, known.seen, spread, strict=False):
         rows.append((str(Label(state.name, state.unit)), f"{all_:.3g}", f"{share:.0%}"))
-        if share < _SEEN:
+        if share < SEEN:
             text = f"{state.name} hardly shows in the outputs: what is learned of it rests on the equations"
             found.add("advice", "states", text)
     header = ("state", "spread", "of its variance, outputs tell")
