@@ -35,6 +35,7 @@ from .mpc import (
     StateBounds as StateBounds,
 )
 from .plants import (
+    BlackBoxPlant as BlackBoxPlant,
     Input as Input,
     Limit as Limit,
     Output as Output,

@@ -17,7 +17,7 @@ from .options import Json, Seed
 
 if TYPE_CHECKING:
     from mpcoffline.datasets.logs.reading import LoggedTable
-    from mpcoffline.plants import Plant
+    from mpcoffline.plants import BlackBoxPlant, Plant
     from mpcoffline.tune import LogCheck
 
 app = typer.Typer()
@@ -142,10 +142,10 @@ def check(
     """
     options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
     with working("Reading log and description"):
-        from mpcoffline.plants import load_plant
+        from mpcoffline.plants import load_description
         from mpcoffline.tune import check_log
 
-        plant = load_plant(file)
+        plant = load_description(file)
         table = plant.read(logs, **options)
     with working("Comparing them") as status:
         found = check_log(plant, table, seed=seed, tell=lambda what: status.update(f"Comparing them: {what}"))
@@ -210,7 +210,7 @@ def _show(found: LogCheck) -> None:
         console.print()
 
 
-def _document(plant: Plant, table: LoggedTable, found: LogCheck) -> dict[str, Any]:
+def _document(plant: Plant | BlackBoxPlant, table: LoggedTable, found: LogCheck) -> dict[str, Any]:
     report = table.report
     return {
         "plant": plant.name,

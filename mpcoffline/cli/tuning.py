@@ -78,10 +78,10 @@ def tune(
     options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
     _tell(f"Reading {', '.join(log.name for log in logs)}")
     with working("Reading"):
-        from mpcoffline.plants import load_plant
+        from mpcoffline.plants import load_description
         from mpcoffline.tune import tune as tuned
 
-        plant = load_plant(file)
+        plant = load_description(file)
         table = plant.read(logs, **options)
     _tell(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
     try:

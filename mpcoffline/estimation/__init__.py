@@ -13,6 +13,7 @@ from .residual import Residual, fit_residual, fit_residuals, with_residual
 from .sensors import Sensors
 from .smoothing import NoiseEstimate, estimate_noise, smooth, with_measurement_noise
 from .structure import MultiStepCheck
+from .subspace import LinearModel, linear_model
 
 __all__ = [
     "DelaySearch",
@@ -20,6 +21,7 @@ __all__ = [
     "Identification",
     "IdentificationConfig",
     "KalmanObserver",
+    "LinearModel",
     "MultiStepCheck",
     "NoiseEstimate",
     "OutputIdentification",
@@ -31,6 +33,7 @@ __all__ = [
     "fit_residuals",
     "identify",
     "identify_from_outputs",
+    "linear_model",
     "smooth",
     "with_measurement_noise",
     "with_profiles",

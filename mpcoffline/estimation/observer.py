@@ -50,8 +50,9 @@ def disturbed_plant(mpc: MPC, n_disturbances: int) -> tuple[tuple[ca.SX, ca.SX, 
     n, m = mpc.layout.n_states, n_disturbances
     z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
     theta = ca.SX.sym("theta", mpc.space.size)
-    disturbed = acting + ca.vertcat(z[n:], ca.SX.zeros(acting.numel() - m)) if m else acting
-    return (z, acting, theta), ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), z[n:])
+    loads = z[n:, 0]  # of one state and no load, z[1:] is a row
+    disturbed = acting + ca.vertcat(loads, ca.SX.zeros(acting.numel() - m)) if m else acting
+    return (z, acting, theta), ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), loads)
 
 
 class OutputModel:

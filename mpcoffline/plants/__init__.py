@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from .black_box import BlackBoxPlant
 from .description import Plant
 from .environment import PlantEnv
 from .nominal import nominal_mpc
 from .outputs import Output
-from .plant_file import load_plant
+from .plant_file import load_description, load_plant
 from .quantities import Input, Limit, State
 
-__all__ = ["Input", "Limit", "Output", "Plant", "PlantEnv", "State", "load_plant", "nominal_mpc"]
+__all__ = [
+    "BlackBoxPlant",
+    "Input",
+    "Limit",
+    "Output",
+    "Plant",
+    "PlantEnv",
+    "State",
+    "load_description",
+    "load_plant",
+    "nominal_mpc",
+]

@@ -17,6 +17,7 @@ from .quantities import Values
 #: What each argument of a function holds.
 MEANINGS = {
     "x": "states",
+    "y": "outputs",
     "u": "inputs",
     "d": "signals",
     "p": "parameters",
@@ -76,7 +77,7 @@ def called(what: str, function: Callable[..., Any], values: Mapping[str, Values]
     except Exception as error:
         if isinstance(error, MPCOfflineError) and error.name.startswith(what):
             raise
-        file = getattr(getattr(function, "__code__", None), "co_filename", None)
+        file = getattr(getattr(inspect.unwrap(function), "__code__", None), "co_filename", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         place = place_of(function, lines[-1] if lines else None)
         where = f"{what} ({place})" if place else what

@@ -36,7 +36,7 @@ class Output:
 
     Args:
         name: What logs call it: a Python identifier.
-        of: A function of the states ``x``; or the name of one.
+        of: A function of the states ``x``; or the name of one, its own by default.
         unit: Its unit.
         low: The least that the sensor gives.
         high: The largest.
@@ -47,7 +47,7 @@ class Output:
     """
 
     name: str
-    of: str | Callable[..., Any]
+    of: str | Callable[..., Any] | None = None
     unit: str = ""
     low: float = -math.inf
     high: float = math.inf
@@ -56,7 +56,7 @@ class Output:
     def __post_init__(self) -> None:
         check_quantity("output", self)
         of: object = self.of
-        if not isinstance(of, str) and not callable(of):
+        if not (of is None or isinstance(of, str) or callable(of)):
             expected = "a function of x, or the name of a state"
             raise InvalidArgumentError(f"output {self.name}: of", expected=expected, actual=repr(of)[:200])
         if self.noise is not None:
@@ -83,6 +83,7 @@ def checked_outputs(plant: Plant, given: object) -> tuple[Output, ...]:
         output = _of_state(states[each]) if isinstance(each, str) and each in states else each
         if not isinstance(output, Output):
             raise _unknown("outputs", str(output), states)
+        output = output if output.of is not None else replace(output, of=output.name)
         if isinstance(output.of, str) and output.of not in states:
             raise _unknown(f"output {output.name}: of", output.of, states)
         found.append(output)
@@ -110,11 +111,11 @@ def outputs_function(plant: Plant) -> ca.Function:
     rows = []
     for output in plant.outputs:
         of = output.of
-        if isinstance(of, str):
-            rows.append(values[names.index(of)])
-        else:
+        if callable(of):
             what = f"output {output.name}"
             rows.append(number(what, called(what, of, plant.values(values))))
+        else:
+            rows.append(values[names.index(of or output.name)])
     return ca.Function("outputs", [x], [ca.densify(ca.vertcat(*rows))])
 
 

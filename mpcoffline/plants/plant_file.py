@@ -11,6 +11,7 @@ from types import ModuleType
 
 from mpcoffline.core.errors import InvalidDataError, MPCOfflineError, StorageError
 
+from .black_box import BlackBoxPlant
 from .description import Plant
 
 
@@ -24,11 +25,28 @@ def load_plant(path: str | Path) -> Plant:
 
     Raises:
         StorageError: If it cannot be read.
-        InvalidDataError: If it is no Python, raises an error (named with its line), or defines no plant.
+        InvalidDataError: If it is no Python, raises an error (named with its line), or defines no plant with equations.
+    """
+    plant = load_description(path)
+    if isinstance(plant, BlackBoxPlant):
+        hint = "`mpcoffline check` and `tune` find a model in a log; in Python: plant.modelled(plant.read(log))."
+        raise InvalidDataError(str(path), expected="a Plant, with equations", actual="a BlackBoxPlant", hint=hint)
+    return plant
+
+
+def load_description(path: str | Path) -> Plant | BlackBoxPlant:
+    """Runs a plant file as :func:`load_plant` does, and takes a plant without equations, too.
+
+    Args:
+        path: The file.
+
+    Raises:
+        StorageError: As :func:`load_plant`.
+        InvalidDataError: Likewise, but for a plant without equations.
     """
     file = Path(path)
     module = run_plant_file(file)
-    found = {name: value for name, value in vars(module).items() if isinstance(value, Plant)}
+    found = {name: value for name, value in vars(module).items() if isinstance(value, Plant | BlackBoxPlant)}
     plant = found.get("plant") or (next(iter(found.values())) if len(set(map(id, found.values()))) == 1 else None)
     if plant is None:
         hint = "Write `plant = Plant(...)` into it; `mpcoffline new FILE.py` makes a file to begin with."

@@ -17,7 +17,7 @@ from mpcoffline.estimation.multi_step import Windows, open_loop
 from mpcoffline.estimation.plant import plant_rows
 from mpcoffline.estimation.trajectories import Trajectories
 from mpcoffline.mpc import MPC
-from mpcoffline.plants import Plant
+from mpcoffline.plants import BlackBoxPlant, Plant
 
 from .covered import coverage, gain, goal, quiet, readable, sampling
 from .determined import parameters
@@ -33,12 +33,16 @@ _TREND, _SURE = 0.05, 5.0  # of the errors' variance, and standard errors
 
 @one_blas_thread()
 def check_log(
-    plant: Plant, table: TransitionTable, *, seed: int = 0, tell: Callable[[str], None] = lambda _: None
+    plant: Plant | BlackBoxPlant,
+    table: TransitionTable,
+    *,
+    seed: int = 0,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> LogCheck:
     """Compares a plant's description with a log of it, before anything is fitted.
 
     Args:
-        plant: The description.
+        plant: The description; one without equations gets a linear model of the log first.
         table: The log, as :meth:`mpcoffline.Plant.read` gives it.
         seed: Seeds the choice of rows.
         tell: Is told, in a word, what is looked at now: on a busy machine it takes minutes.
@@ -46,9 +50,16 @@ def check_log(
     Returns:
         The page; ``print`` shows it.
 
+    Raises:
+        InvalidDataError: If there are no equations, and the log says too little for a model.
     """
+    plant, model = with_equations(plant, table, seed, tell)
     if plant.outputs:
-        return check_outputs(plant, table, seed=seed, tell=tell)
+        found = check_outputs(plant, table, seed=seed, tell=tell)
+        if model:
+            found.add("advice", "model", model)
+            found.sort()
+        return found
     mpc, found = plant.mpc(), LogCheck()
     readable(table, found)
     tell("units, signs, sampling")
@@ -83,6 +94,17 @@ def check_log(
     _trend(plant, mpc, table, found)
     found.sort()
     return found
+
+
+def with_equations(
+    plant: Plant | BlackBoxPlant, table: TransitionTable, seed: int, tell: Callable[[str], None]
+) -> tuple[Plant, str]:
+    """The plant, with a linear model of the log where it has no equations; and what is to be said of that."""
+    if isinstance(plant, Plant):
+        return plant, ""
+    tell("No equations are described: a linear model is looked for in the log")
+    model = plant.model(table, seed=seed)
+    return plant.modelled(model), str(model)
 
 
 def _dead_time(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck, seed: int) -> MPC:

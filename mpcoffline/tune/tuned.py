@@ -112,9 +112,10 @@ class Tuned:
             return "the controller of the trial as it was: nothing better was learned"
         if self.document["policy"] != FIRST:
             return f"the proposal, {self.document['policy']!r}"
+        of = "linear model of the log" if self.document.get("model") else "plant file"
         if self.document["proposal"] == FIRST:
-            return "MPC_1, the controller of the plant file as it is: nothing better was learned"
-        return "MPC_1, the controller of the plant file as it is; what was learned is in learner.zip, not recommended"
+            return f"MPC_1, the controller of the {of} as it is: nothing better was learned"
+        return f"MPC_1, the controller of the {of} as it is; what was learned is in learner.zip, not recommended"
 
     @property
     def costs(self) -> Table:
@@ -127,6 +128,12 @@ class Tuned:
     def next_steps(self) -> tuple[str, ...]:
         """What to do now, commands included."""
         at = shlex.quote(str(self.folder))
+        if self.verdict == KEEP and self.document.get("model"):
+            return (
+                "MPC_1 is new, too: it acts on a linear model of the log. Where it costs clearly less than today's"
+                " controller, above, it is worth a trial under supervision, of which you keep the log:",
+                f"  mpcoffline serve {at}/{POLICY} --log trial.csv",
+            )
         if self.verdict == KEEP:
             return (
                 "Read the reasons: each says what would change it. A log that says more is worth most:"

@@ -15,18 +15,18 @@ from mpcoffline.datasets.logs.reading import LoggedTable
 from mpcoffline.datasets.table.files import hash_of, save_table
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.diagnostics.page import Section
-from mpcoffline.plants import Plant
+from mpcoffline.plants import BlackBoxPlant, Plant
 from mpcoffline.plants.outputs import OutputReader
 
 from .folder import HIDDEN, OUTPUTS, Workplace, identity_of, read_run
-from .log_check import check_log
+from .log_check import check_log, with_equations
 from .making import Order, Tell, check_options, made
 from .page import LogCheck
 from .tuned import Tuned
 
 
 def tune(
-    plant: Plant,
+    plant: Plant | BlackBoxPlant,
     table: TransitionTable,
     out: str | PathLike[str],
     *,
@@ -57,7 +57,7 @@ def tune(
         >>> action, state = tuned.policy.predict(observation)
 
     Args:
-        plant: The plant.
+        plant: The plant; one without equations gets a linear model of the log (:class:`mpcoffline.BlackBoxPlant`).
         table: A log of it, as :meth:`mpcoffline.Plant.read` gives it.
         out: The folder.
         seed: Of everything random: the same seed, data and machine give the same folder.
@@ -73,6 +73,7 @@ def tune(
         UnknownIdError: For an unknown preset.
     """
     tell = tell or (lambda _: None)
+    plant, model = with_equations(plant, table, seed, tell)
     mpc = plant.mpc()
     options = check_options(options | {"seed": seed}, mpc)
     reader = _reader(plant)
@@ -104,7 +105,6 @@ def tune(
         tell(f"  {outputs}")
         said = place.once("check", lambda: _said(found))
         save_table(table, place.path / OUTPUTS)
-        save_table(table, place.path / OUTPUTS)
     else:
         said = place.once("check", lambda: _said(checked()))
     for each in said["remarks"]:
@@ -116,10 +116,14 @@ def tune(
         mpc,
         table if outputs is None else outputs.table,
         options,
-        sections=[_section(table, said)],
+        sections=[_section(table, said, model)],
         outputs=outputs,
     )
-    document = made(order, place, tell, show_progress=show_progress) | {"check": said, **_read_as(table)}
+    document = made(order, place, tell, show_progress=show_progress) | {
+        "check": said,
+        "model": model,
+        **_read_as(table),
+    }
     former = place.finish(document)
     return Tuned(place.folder, read_run(place.folder), former=former)
 
@@ -146,10 +150,11 @@ def _read_as(table: TransitionTable) -> dict[str, Any]:
     return {"read": {"header": table.header, "options": options}}
 
 
-def _section(table: TransitionTable, said: dict[str, Any]) -> Section:
-    """What the page says of the log before the fit."""
+def _section(table: TransitionTable, said: dict[str, Any], model: str) -> Section:
+    """What the page says of the log before the fit, and of a model that it gave."""
     remarks = [each for each in said["remarks"] if each["about"] != "gain"]
-    items = [f"{each['about']}: {each['text']}" for each in remarks]
+    items = [f"model: {model}"] if model else []
+    items += [f"{each['about']}: {each['text']}" for each in remarks]
     if not isinstance(table, LoggedTable):
         return Section("What the check found", (said["verdict"],), items)
     report = table.report

@@ -164,3 +164,39 @@ def test_dead_time_is_found_in_outputs(files: tuple[Path, Path], tmp_path: Path)
     assert "pump acts 3 steps late. Write delay=3" in about(found, "advice", "dead time")
     assert found.outputs is not None
     assert found.outputs.mpc.layout.delay == (3,)
+
+
+WITHOUT_EQUATIONS = """
+from mpcoffline import BlackBoxPlant, Input, Output
+
+plant = BlackBoxPlant(
+    "hidden tanks",
+    dt=5.0,
+    outputs=[Output("gauge", unit="mbar", low=0.0, high=30.0)],
+    inputs=[Input("pump", "V", 0, 6)],
+    cost={"gauge": 4.0, "pump": 0.02},
+    references={"gauge": 7.0},
+    horizon=20,
+    steps=40,
+)
+"""
+
+
+def test_a_plant_without_equations_gets_a_model_of_its_log(files: tuple[Path, Path], tmp_path: Path) -> None:
+    plant, out = tmp_path / "unknown.py", tmp_path / "tuned"
+    plant.write_text(WITHOUT_EQUATIONS)
+    done = CliRunner().invoke(app, ["check", str(plant), str(files[1])])
+    assert done.exit_code == 0, done.output
+    assert "A linear model with 2 states" in done.output
+    done = CliRunner().invoke(app, ["tune", str(plant), str(files[1]), "--out", str(out), "--preset", "fast"])
+    assert done.exit_code == 0, done.output
+    assert "A linear model with 2 states" in (out / "report.html").read_text(encoding="utf-8")
+    policy, env = Tuned.load(out).output_policy, load_plant(files[0].parent / "truth.py").env(spread=0.0, steps=80)
+    lower = []
+    for seed in range(3):
+        (y, info), state = env.reset(seed=100 + seed), None
+        for _ in range(80):
+            u, state = policy.predict(y, state)
+            y, *_, info = env.step(u)
+        lower.append(info["state"][1])
+    np.testing.assert_allclose(lower, 10.0, atol=1.0)  # 7 mbar
