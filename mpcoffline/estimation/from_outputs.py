@@ -31,7 +31,7 @@ from .output_episodes import (
     smoothed_states,
     with_states,
 )
-from .sensors import Sensors, listed
+from .sensors import Sensors, listed, steps_late
 
 _log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class OutputIdentification:
 
     def _late(self) -> str:
         delay = self.mpc.layout.delay
-        return f"Inputs act {', '.join(map(str, delay))} steps late. " if any(delay) else ""
+        return f"Inputs act {steps_late(delay)}. " if any(delay) else ""
 
 
 def identify_from_outputs(

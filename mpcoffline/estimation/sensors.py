@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,3 +123,8 @@ class Sensors:
 def listed(values: Array) -> str:
     """Numbers with three digits, for a sentence."""
     return ", ".join(f"{v:.3g}" for v in values)
+
+
+def steps_late(delay: Sequence[int]) -> str:
+    """Dead times, for a sentence."""
+    return f"{', '.join(map(str, delay))} {'step' if max(delay) == 1 else 'steps'} late"

@@ -16,7 +16,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 from .scaled_episodes import ScaledEpisodes
-from .sensors import listed
+from .sensors import listed, steps_late
 from .structure import clearly_negative
 
 AHEAD = 15  #: Steps that are predicted to judge a model, or as many as episodes allow.
@@ -77,7 +77,7 @@ class LinearModel:
 
     def __str__(self) -> str:
         """What it is, in a sentence or two."""
-        late = f", inputs {', '.join(map(str, self.delay))} steps late" if any(self.delay) else ""
+        late = f", inputs {steps_late(self.delay)}" if any(self.delay) else ""
         return (
             f"A linear model with {self.order} {'state' if self.order == 1 else 'states'}{late}, from the log alone."
             f" {self.steps} steps ahead it misses outputs of episodes held out by {listed(100.0 * self.missed)} % of"
