@@ -95,7 +95,7 @@ Value = Annotated[
         autocompletion=beginning(_value_methods),
     ),
 ]
-TaskArgument = Annotated[Task, typer.Argument(help="Which task.", show_default=False)]
+TaskArgument = Annotated[Task, typer.Argument(metavar="TASK", help="Which task.", show_default=False)]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 Alpha = Annotated[
     float,
@@ -105,9 +105,13 @@ PlantAlpha = Annotated[
     float | None, typer.Option("--alpha", help="Plant of the linear task.", show_default="the environment's", min=0.0)
 ]
 Controller = Annotated[
-    Path, typer.Argument(help="A saved policy or learner (.zip).", exists=True, dir_okay=False, show_default=False)
+    Path,
+    typer.Argument(
+        metavar="POLICY.zip", help="A saved policy, or a learner.", exists=True, dir_okay=False, show_default=False
+    ),
 ]
 LearnerFile = Annotated[
-    Path, typer.Argument(help="A saved learner (.zip).", exists=True, dir_okay=False, show_default=False)
+    Path,
+    typer.Argument(metavar="LEARNER.zip", help="A saved learner.", exists=True, dir_okay=False, show_default=False),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, for machines.")]

@@ -94,7 +94,9 @@ def tune(
 
 @app.command(epilog=examples("mpcoffline retune tuned/ trial.csv", "mpcoffline retune tuned/ a.csv b.csv --json"))
 def retune(
-    folder: Annotated[Path, typer.Argument(metavar="TUNED", help="The folder of tune.", exists=True, file_okay=False)],
+    folder: Annotated[
+        Path, typer.Argument(metavar="TUNED", help="The folder that tune made.", exists=True, file_okay=False)
+    ],
     trial: Logs,
     column: Columns = None,
     unit: Units = None,

@@ -104,7 +104,6 @@ def tune(
         tell(f"  {outputs}")
         said = place.once("check", lambda: _said(found))
         save_table(table, place.path / OUTPUTS)
-        save_table(table, place.path / OUTPUTS)
     else:
         said = place.once("check", lambda: _said(checked()))
     for each in said["remarks"]:
