@@ -114,6 +114,8 @@ def _plain_flags(command: Any, ctx: Any) -> Any:
     _without_types(command.params)
     if (helps := command.get_help_option(ctx)) is not None:  # kept by the command, once made
         _without_types([helps])
+    for inner in getattr(command, "commands", {}).values():
+        _plain_flags(inner, ctx)
     return command
 
 

@@ -73,8 +73,8 @@ def test_what_the_log_covers_leaves_out_previews_and_clocks() -> None:
         cost=lambda x, u, d: d.price * u.power,
     )
     rng, found = np.random.default_rng(0), LogCheck()
-    log = {"time": 3600.0 * np.arange(300), "level": 5 + rng.normal(size=300), "power": rng.uniform(-1, 1, 300)}
-    coverage(plant, plant.read(log | {"price": rng.uniform(0.25, 0.75, 300)}), found)
+    log = {"time": 3600.0 * np.arange(300), "level": 5 + rng.normal(size=300), "power": rng.choice([-1, 1], 300)}
+    coverage(plant, plant.read(log | {"price": rng.choice([0.25, 0.75], 300)}), found)
     (covered,) = found.tables
     assert [row[0] for row in covered.rows] == ["level [kWh]", "price [EUR/kWh]", "power [kW]"]
     assert [row[-1] for row in covered.rows[1:]] == ["50%", "100%"]
