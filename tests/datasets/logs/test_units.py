@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.datasets.logs.units import conversion
 
