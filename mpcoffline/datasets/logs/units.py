@@ -32,7 +32,7 @@ _WORDS = {
     "Sek": "second",
     "mmH2O": "millimeter_H2O",
 }
-_WORD = re.compile(rf"(?<![A-Za-z])({'|'.join(_WORDS)})(?![A-Za-z])")
+_WORD = re.compile(r"((?<![A-Za-z])(RPM|gpm|sccm|mmH2O)|(?<=/)(Std|Sek))(?![A-Za-z])")  # T_Std is no time
 _DEGREES = {"C": "degC", "F": "degF"}  # alone, they are units of charge and capacity
 _PRESSURE = re.compile(r"^((?:[mk]|h)?(?:bar|Pa)|MPa|psi)\s*[_(]?([ga])\)?$")  # gauge or absolute
 _ANGLE = re.compile(r"rad|deg|°|turn|rev|rp[ms]|U/|Upm", re.IGNORECASE)
