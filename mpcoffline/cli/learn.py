@@ -24,7 +24,7 @@ from .options import (
     Task,
     Value,
     beginning,
-    checked_discount,
+    checked_share,
     dataset_ids,
     tasks_and_files,
 )
@@ -103,9 +103,7 @@ def learn(
     value: Value = None,
     discount: Annotated[
         float | None,
-        typer.Option(
-            help="Discount of a step, gamma, in (0, 1].", show_default="the preset's", callback=checked_discount
-        ),
+        typer.Option(help="Discount of a step, gamma, in (0, 1].", show_default="the preset's", callback=checked_share),
     ] = None,
     horizon: Annotated[
         int | None, typer.Option(help="Steps that the learned MPC looks ahead, N.", show_default="the preset's", min=1)

@@ -78,8 +78,8 @@ def _value_methods() -> list[str]:
     return ["auto", *VALUE_METHODS]
 
 
-def checked_discount(given: float | None) -> float | None:
-    """Refuses what is no discount, before anything heavy is imported."""
+def checked_share(given: float | None) -> float | None:
+    """Refuses what is no share, before anything heavy is imported."""
     if given is not None and not 0.0 < given <= 1.0:
         raise typer.BadParameter(f"{given:g} is not in (0, 1].")
     return given

@@ -35,7 +35,9 @@ def readable(table: TransitionTable, found: LogCheck) -> None:
     """What was read, and sensors that were stuck."""
     report = getattr(table, "report", None)
     found.head = str(report) if report is not None else repr(table)
-    stuck = [each for each in (report.left_out if report is not None else ()) if each.why.startswith(_STUCK)]
+    if report is None:
+        return
+    stuck = [each for each in report.left_out if each.why.startswith(_STUCK)]
     for each in stuck:
         share = sum(other.count for other in stuck if other.what == each.what) / max(report.rows, 1)
         text = f"{each.why}, {each.count} rows from {each.first} on"

@@ -66,7 +66,7 @@ def _registry() -> Any:
         import pint
     except ImportError as error:
         raise InvalidArgumentError("units", expected="the package pint", actual="not installed", hint=EXTRA) from error
-    registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry: Any = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
     registry.define("millimeter_H2O = 0.1 * centimeter_H2O")
     for each in _CURRENCIES:
         registry.define(f"{each} = [{each}]")
