@@ -72,7 +72,12 @@ class ErrorGroup(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of a name; that of another package is not loaded for it."""
-        return super().get_command(ctx, cmd_name) or self._added.get(cmd_name)
+        found = super().get_command(ctx, cmd_name)
+        return self._added.get(cmd_name) if found is None else _plain_flags(found, ctx)
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The program's own options."""
+        return _without_types(super().get_params(ctx))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that is called."""
@@ -102,6 +107,23 @@ class ErrorGroup(TyperGroup):
             raise typer.Exit(
                 USAGE_ERROR if _of_an_option(error, ctx.invoked_subcommand, self) else USER_ERROR
             ) from error
+
+
+def _plain_flags(command: Any, ctx: Any) -> Any:
+    """A command whose help does not call its flags ``<bool>``, as if they took a value."""
+    _without_types(command.params)
+    if (helps := command.get_help_option(ctx)) is not None:  # kept by the command, once made
+        _without_types([helps])
+    for inner in getattr(command, "commands", {}).values():
+        _plain_flags(inner, ctx)
+    return command
+
+
+def _without_types(params: list[Any]) -> list[Any]:
+    for each in params:
+        if getattr(each, "is_flag", False) and each.metavar is None:
+            each.metavar = ""
+    return params
 
 
 def _of_an_option(error: Exception, called: str | None, group: ErrorGroup) -> bool:

@@ -21,6 +21,7 @@ FOUND_WRONG = 1
 Id = Annotated[
     str,
     typer.Argument(
+        metavar="DATASET",
         help="Data set id, e.g. mpcoffline/pendulum/ddpg-v0.",
         show_default=False,
         autocompletion=beginning(dataset_ids),

@@ -24,7 +24,7 @@ from .options import (
     Task,
     Value,
     beginning,
-    checked_discount,
+    checked_share,
     dataset_ids,
     tasks_and_files,
 )
@@ -102,10 +102,11 @@ def learn(
     learn: Annotated[Learn, typer.Option(help="cost: MPC_2; cost+model: MPC_3.")] = Learn.cost_and_model,
     value: Value = None,
     discount: Annotated[
-        float | None, typer.Option(help="gamma, in (0, 1].", show_default="the preset's", callback=checked_discount)
+        float | None,
+        typer.Option(help="Discount of a step, gamma, in (0, 1].", show_default="the preset's", callback=checked_share),
     ] = None,
     horizon: Annotated[
-        int | None, typer.Option(help="N of the learned MPC.", show_default="the preset's", min=1)
+        int | None, typer.Option(help="Steps that the learned MPC looks ahead, N.", show_default="the preset's", min=1)
     ] = None,
     steps: Annotated[
         int | None, typer.Option(help="Gradient steps of (VALUE).", show_default="the preset's", min=1)

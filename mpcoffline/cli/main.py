@@ -25,7 +25,8 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Start with:\n\nmpcoffline run pendulum\n\nSomething wrong? Run:\n\nmpcoffline doctor",
+    epilog="Start with:\n\nmpcoffline run pendulum\n\nWith a plant of your own:\n\nmpcoffline new plant.py\n\n"
+    "Something wrong? Run:\n\nmpcoffline doctor",
 )
 
 

@@ -78,8 +78,8 @@ def _value_methods() -> list[str]:
     return ["auto", *VALUE_METHODS]
 
 
-def checked_discount(given: float | None) -> float | None:
-    """Refuses what is no discount, before anything heavy is imported."""
+def checked_share(given: float | None) -> float | None:
+    """Refuses what is no share, before anything heavy is imported."""
     if given is not None and not 0.0 < given <= 1.0:
         raise typer.BadParameter(f"{given:g} is not in (0, 1].")
     return given
@@ -95,7 +95,7 @@ Value = Annotated[
         autocompletion=beginning(_value_methods),
     ),
 ]
-TaskArgument = Annotated[Task, typer.Argument(help="Which task.", show_default=False)]
+TaskArgument = Annotated[Task, typer.Argument(metavar="TASK", help="Which task.", show_default=False)]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 Alpha = Annotated[
     float,
@@ -105,9 +105,13 @@ PlantAlpha = Annotated[
     float | None, typer.Option("--alpha", help="Plant of the linear task.", show_default="the environment's", min=0.0)
 ]
 Controller = Annotated[
-    Path, typer.Argument(help="A saved policy or learner (.zip).", exists=True, dir_okay=False, show_default=False)
+    Path,
+    typer.Argument(
+        metavar="POLICY.zip", help="A saved policy, or a learner.", exists=True, dir_okay=False, show_default=False
+    ),
 ]
 LearnerFile = Annotated[
-    Path, typer.Argument(help="A saved learner (.zip).", exists=True, dir_okay=False, show_default=False)
+    Path,
+    typer.Argument(metavar="LEARNER.zip", help="A saved learner.", exists=True, dir_okay=False, show_default=False),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, for machines.")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,7 +36,7 @@ PlantFile = Annotated[
 Logs = Annotated[
     list[Path],
     typer.Argument(
-        metavar="LOG...",
+        metavar="LOG",
         help="Logs of the plant: CSV, Parquet or Arrow.",
         exists=True,
         dir_okay=False,
@@ -47,15 +48,23 @@ Columns = Annotated[
     typer.Option(
         "--column",
         metavar="NAME=HEADER",
-        help="A header that is not the plant's name, or its first word; repeatable. In a plant file: columns={...}.",
+        help="The header of a column that is not called by the plant's name, or its first words; repeatable. In a plant"
+        " file: columns={...}.",
     ),
 ]
 Units = Annotated[
     list[str] | None,
-    typer.Option("--unit", metavar="NAME=UNIT", help="A unit that the header does not say; repeatable."),
+    typer.Option(
+        "--unit", metavar="NAME=UNIT", help="The log's unit, where its header says none or another; repeatable."
+    ),
 ]
 Where = Annotated[
-    list[str] | None, typer.Option("--where", metavar="HEADER=VALUE", help="Rows that count, as mode=AUTO; repeatable.")
+    list[str] | None,
+    typer.Option(
+        "--where",
+        metavar="HEADER=VALUE",
+        help="Read rows with this value alone, as mode=AUTO; the same header again: or with that one.",
+    ),
 ]
 Time = Annotated[
     list[str] | None,
@@ -171,7 +180,7 @@ def read_options(
     return {
         "columns": pairs("--column", column),
         "units": pairs("--unit", unit),
-        "where": pairs("--where", where),
+        "where": _values(where),
         "time": None if not time else time if len(time) > 1 else time[0],
         "time_format": time_format,
         "timezone": timezone,
@@ -181,14 +190,29 @@ def read_options(
 
 
 def pairs(option: str, given: list[str] | None) -> dict[str, str]:
-    """NAME=VALUE, several of them."""
-    found = {}
+    """NAME=VALUE, several of them, each name once."""
+    found: dict[str, str] = {}
+    for name, value in _split(option, given):
+        if name in found:
+            raise typer.BadParameter(f"{name!r} is given twice, {found[name]!r} and {value!r}.", param_hint=option)
+        found[name] = value
+    return found
+
+
+def _values(given: list[str] | None) -> dict[str, str | list[str]]:
+    """HEADER=VALUE, several of them; of a header that comes again, rows with any of its values count."""
+    found: dict[str, list[str]] = {}
+    for name, value in _split("--where", given):
+        found.setdefault(name, []).append(value)
+    return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
+
+
+def _split(option: str, given: list[str] | None) -> Iterator[tuple[str, str]]:
     for each in given or []:
         name, sign, value = each.partition("=")
         if not (name.strip() and sign):
             raise typer.BadParameter(f"expected NAME=VALUE, got {each!r}.", param_hint=option)
-        found[name.strip()] = value.strip()
-    return found
+        yield name.strip(), value.strip()
 
 
 def _show(found: LogCheck) -> None:

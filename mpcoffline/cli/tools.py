@@ -69,7 +69,7 @@ class Waste(StrEnum):
 @app.command(epilog=examples("mpcoffline clean", "mpcoffline clean --yes", "mpcoffline clean downloads backups"))
 def clean(
     kinds: Annotated[
-        list[Waste] | None, typer.Argument(help="What to look for.", show_default="leftovers caches")
+        list[Waste] | None, typer.Argument(metavar="KIND", help="What to look for.", show_default="leftovers caches")
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Remove it.")] = False,
     as_json: Json = False,

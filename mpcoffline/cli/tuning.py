@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
@@ -11,7 +11,7 @@ from rich.text import Text
 from mpcoffline.core.errors import visible
 
 from .common import console, examples, message, print_json, say_prose, working
-from .options import Json, Preset, Seed
+from .options import Json, Preset, Seed, checked_share
 from .own_plants import (
     Columns,
     Episode,
@@ -64,6 +64,16 @@ def tune(
             help="Move the best candidate's weights, too, by what closed loops cost; needs mpcoffline[polish].",
         ),
     ] = False,
+    keep_limits: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Make limits tighter until simulated closed loops keep the given ones in this share of their steps, as"
+            " 0.95; a plan that keeps a limit to the digit is pushed over it by what nobody predicts.",
+            show_default="as they are",
+            callback=checked_share,
+        ),
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -85,7 +95,8 @@ def tune(
         table = plant.read(logs, **options)
     _tell(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
     try:
-        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=_tell)
+        more: dict[str, Any] = {} if keep_limits is None else {"keep_limits": keep_limits}
+        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=_tell, **more)
     except KeyboardInterrupt:
         _tell("What was finished is kept: the same command goes on from there.")
         raise
@@ -94,7 +105,9 @@ def tune(
 
 @app.command(epilog=examples("mpcoffline retune tuned/ trial.csv", "mpcoffline retune tuned/ a.csv b.csv --json"))
 def retune(
-    folder: Annotated[Path, typer.Argument(metavar="TUNED", help="The folder of tune.", exists=True, file_okay=False)],
+    folder: Annotated[
+        Path, typer.Argument(metavar="TUNED", help="The folder that tune made.", exists=True, file_okay=False)
+    ],
     trial: Logs,
     column: Columns = None,
     unit: Units = None,

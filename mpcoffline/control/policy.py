@@ -147,14 +147,14 @@ class MPCPolicy(BasePolicy):
         """Counts since construction."""
         return self._fallback.stats
 
-    def retry_at_most(self, share: float) -> None:
+    def retry_at_most(self, share: float, level: int = logging.WARNING) -> None:
         """Limits which share of its problems is tried again from all starts, beyond the first thousand.
 
         A retry takes as long as some hundred warm solves, too long for one of many MPCs whose solves fail again and
-        again. Raises :class:`InvalidArgumentError` for a share outside 0 to 1.
+        again; at ``level`` the log tells of those. Raises :class:`InvalidArgumentError` for a share outside 0 to 1.
         """
         check_number("share", share, 0.0, 1.0, open_low=False)
-        self._fallback.most_retried = share
+        self._fallback.most_retried, self._fallback.level = share, level
 
     @property
     def exploration_noise(self) -> float:

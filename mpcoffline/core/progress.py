@@ -8,6 +8,8 @@ from typing import Self
 class Bars:
     """Progress bars by name, one under another, on rich's console; or nothing at all.
 
+    Where that is no terminal, as in a file, each name is a line, once it begins.
+
     Example:
         >>> with Bars() as bars:
         ...     for k in range(1000):
@@ -20,6 +22,7 @@ class Bars:
     """
 
     def __init__(self, shown: bool = True, *, of_bytes: bool = False) -> None:
+        from rich import get_console
         from rich.progress import (
             BarColumn,
             DownloadColumn,
@@ -44,7 +47,9 @@ class Bars:
         bytes_, steps = (DownloadColumn, TransferSpeedColumn), (Counts, TimeRemainingColumn)
         counts: list[ProgressColumn] = [column() for column in (bytes_ if of_bytes else steps)]
         text = TextColumn("{task.description}", markup=False, table_column=Column())  # which wraps: the counts are seen
-        self._bars = Progress(text, BarColumn(bar_width=20), *counts, disable=not shown)
+        console = get_console()
+        self._in_lines = shown and not (console.is_terminal or console.is_jupyter)
+        self._bars = Progress(text, BarColumn(bar_width=20), *counts, disable=not shown or self._in_lines)
         self._tasks: dict[str, TaskID] = {}
         self._busy: TaskID | None = None
 
@@ -69,6 +74,7 @@ class Bars:
         self._rest()
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(name)
+            self._line(name)
         description = f"{name}: {text}" if text else name
         self._bars.update(self._tasks[name], completed=done, total=total, description=description)
 
@@ -80,6 +86,11 @@ class Bars:
         """
         self._rest()
         self._busy = self._bars.add_task(name, total=None)
+        self._line(name)
+
+    def _line(self, name: str) -> None:
+        if self._in_lines:
+            self._bars.console.print(f"  {name}", markup=False, highlight=False)
 
     def _rest(self) -> None:
         if self._busy is not None:

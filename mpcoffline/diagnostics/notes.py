@@ -14,6 +14,7 @@ _GROWN = 1.5
 _UNSTABLE = 1.0 + 1e-3
 _LOST_WEIGHT = 1e-6
 _FAILED = 0.01  # share of the solves
+_OFTEN = 0.05  # of the steps, that a limit is violated in
 
 Rule = Callable[[Report, "Fit"], Iterator[str]]
 
@@ -58,6 +59,17 @@ def _failures(report: Report, fit: Fit) -> Iterator[str]:
                 f"{share:.1%} of the problems of {name} were not solved at first: has its model a corner (fmax, fabs, a"
                 " root) where it works? Smooth it, or let ipopt try these: MPCPolicy(mpc, rescue='ipopt')."
             )
+
+
+def _at_limits(report: Report, _: Fit) -> Iterator[str]:
+    often = [check for check in report.limits if check.shares[2] > _OFTEN]
+    if often:
+        named = listed([f"{check.name!r} in {check.shares[2]:.0%}" for check in often])
+        yield (
+            f"The learned MPC violates {named} of its steps: what is cheapest lies at the limit, and what no model"
+            " knows pushes it over, on the plant more than here. Where that matters, learn with a margin:"
+            " keep_limits=0.95 (mpcoffline tune --keep-limits 0.95)."
+        )
 
 
 def _value(report: Report, fit: Fit) -> Iterator[str]:
@@ -118,6 +130,7 @@ RULES: tuple[Rule, ...] = (
     _goal,
     _noise,
     _failures,
+    _at_limits,
     _value,
     _model,
     _undetermined,
@@ -126,4 +139,4 @@ RULES: tuple[Rule, ...] = (
     _stability,
     _weights,
 )
-_OF_LEARNED = (_model, _growth, _stability, _weights)
+_OF_LEARNED = (_at_limits, _model, _growth, _stability, _weights)

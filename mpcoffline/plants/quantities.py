@@ -151,8 +151,11 @@ class Limit:
         prices: object = self.soft
         if isinstance(prices, Sequence) and not isinstance(prices, str) and len(prices) != 2:
             raise InvalidArgumentError(f"{what}: soft", expected="a price, or a pair", actual=repr(prices)[:200])
-        if not self.low <= self.high or (math.isinf(self.low) and math.isinf(self.high)):
-            raise InvalidArgumentError(what, expected="low <= high, one of them", actual=f"{self.low} and {self.high}")
+        if math.isinf(self.low) and math.isinf(self.high):
+            hint = "For an expression that must not become positive, write high=0."
+            raise InvalidArgumentError(what, expected="low=, high= or both", actual="no bound", hint=hint)
+        if not self.low <= self.high:
+            raise InvalidArgumentError(what, expected="low <= high", actual=f"{self.low:g} and {self.high:g}")
 
 
 class Described(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple, Self
 
@@ -207,11 +208,11 @@ def quick_policy(mpc: MPC) -> MPCPolicy:
     """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem.
 
     It takes as many threads as torch does, which change no digit. Of its solves few are retried: an MPC of which many
-    fail is no good one.
+    fail is no good one. What fails is counted, and told by those who ask; it is no warning, since nothing real moves.
     """
     if "ddp" in SOLVERS and not SOLVERS["ddp"].refuses(mpc):
         policy = MPCPolicy(mpc, "ddp", n_threads=torch.get_num_threads())
-        policy.retry_at_most(_RETRIED)
+        policy.retry_at_most(_RETRIED, logging.INFO)
         with contextlib.suppress(CompilerError):
             _ = policy.solver
             return policy

@@ -119,6 +119,7 @@ class Fallback:
     Attributes:
         stats: Counts of all solves.
         most_retried: Which share of the problems is retried at most, beyond the first thousand; all by default.
+        level: At which level the log tells of what was not solved.
 
     Raises:
         UnknownIdError: For another rescue.
@@ -133,6 +134,7 @@ class Fallback:
         self.mpc, self.rescue, self.rescue_time = mpc, rescue, float(rescue_time)
         self.stats = SolverStats()
         self.most_retried, self._n_tried_again = 1.0, 0
+        self.level = logging.WARNING
         self._rescuer: IpoptSolver | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -197,7 +199,7 @@ class Fallback:
         setattr(self.stats, answer.counter, before + n)
         if n and not before:
             told = ", ".join(sorted(set(reasons[chosen].tolist())))
-            level = logging.INFO if answer is _RETRIED else logging.WARNING
+            level = logging.INFO if answer is _RETRIED else self.level
             logger.log(level, "An MPC was not solved (%s): %s.", told, answer.logged)
 
     def _applied(

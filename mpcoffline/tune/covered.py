@@ -12,7 +12,7 @@ import numpy as np
 from mpcoffline.core.tables import Table
 from mpcoffline.core.text import figure
 from mpcoffline.core.types import Array
-from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation.units import CONVERSIONS, in_words
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.labels import Label
@@ -24,7 +24,7 @@ from .page import LogCheck
 _NEAR = 0.05  # of a state's spread about its goal
 _WORSE = 1.5  # times the identified model's error ahead, of the described one: tuning pays
 _WELL, _AS_NOISE = 0.2, 2.0  # of the spread, ahead; times what noise makes of it
-_STUCK = "stuck"
+_STUCK, _MOSTLY_STUCK = "stuck", 0.05  # of the rows: no incident any more
 _COARSE, _FINE = 1.0, 0.002  # control intervals in time constants
 _FEW = 200  # rows
 _DEGREES = ("°", "deg", "K", "C", "F")  # in a unit that may be one of temperature
@@ -35,9 +35,17 @@ def readable(table: TransitionTable, found: LogCheck) -> None:
     """What was read, and sensors that were stuck."""
     report = getattr(table, "report", None)
     found.head = str(report) if report is not None else repr(table)
-    for each in report.left_out if report is not None else ():
-        if each.why.startswith(_STUCK):
-            found.add("problem", each.what, f"{each.why}, {each.count} rows from {each.first} on: is its sensor well?")
+    if report is None:
+        return
+    stuck = [each for each in report.left_out if each.why.startswith(_STUCK)]
+    for each in stuck:
+        share = sum(other.count for other in stuck if other.what == each.what) / max(report.rows, 1)
+        text = f"{each.why}, {each.count} rows from {each.first} on"
+        if each.lasting or share > _MOSTLY_STUCK:  # what is past and left out cannot be mended any more
+            end = " to the log's end" if each.lasting else ""
+            found.add("problem", each.what, f"{text}{end}: is its sensor well?")
+        else:
+            found.add("advice", each.what, f"{text}: left out. Is its sensor well?")
 
 
 @contextmanager
@@ -53,14 +61,18 @@ def quiet() -> Iterator[None]:
 
 
 def coverage(plant: Plant, table: TransitionTable, found: LogCheck) -> None:
-    """What ranges the log covers, of what is measured, inputs and signals."""
+    """What ranges the log covers, of what is measured, inputs and present signals; previews are the same numbers."""
     statistics = table.statistics()
     layout = plant.mpc().layout
     measured: Sequence[Label] = [Label(q.name, q.unit) for q in plant.measured]
-    labels = [*measured, *layout.y_labels[layout.n_states :], *layout.u_labels]
-    low = np.append(statistics.low.observations, statistics.low.actions)
-    high = np.append(statistics.high.observations, statistics.high.actions)
-    spread = np.append(statistics.std.observations, statistics.std.actions)
+    present = [int(at) for s, at in zip(layout.signals, layout.present, strict=True) if s.period is None]
+    labels = [*measured, *(layout.y_labels[i] for i in present), *layout.u_labels]
+    shown = [*range(len(measured)), *(i - layout.n_states + len(plant.measured) for i in present)]
+
+    def listed(part: Columns) -> Array:
+        return np.append(part.observations[shown], part.actions)
+
+    low, high, spread = (listed(part) for part in (statistics.low, statistics.high, statistics.std))
     rows = []
     quantities: tuple[Any, ...] = (*plant.measured, *plant.inputs, *plant.signals)
     ranges = {q.name: (q.low, q.high) for q in quantities}

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from mpcoffline.cli import common
 from mpcoffline.cli.main import app
 from mpcoffline.cli.options import beginning, environments
+from mpcoffline.cli.own_plants import pairs, read_options
 from mpcoffline.core.tables import Table
 
 LONG = (
@@ -71,3 +72,20 @@ def test_results_have_one_option() -> None:
     assert {name for name, options in written.items() if options} == {
         "run", "reproduce", "tune", "learn", "diagnose", "plot", "export",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", [[], ["check"], ["datasets"], ["datasets", "verify"]])
+def test_a_flag_looks_like_one_and_arguments_are_in_capitals(command: list[str]) -> None:
+    result = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(app, [*command, "--help"])
+    assert result.exit_code == 0
+    assert "<bool>" not in result.stdout.lower()
+    assert "boolean" not in result.stdout.lower()
+    assert "dataset_id" not in result.stdout
+    assert all(len(line.rstrip()) <= 80 for line in result.stdout.splitlines())
+
+
+def test_a_header_that_is_given_again_is_an_or_a_name_that_is_given_again_a_mistake() -> None:
+    options = read_options(["h1=LI"], None, ["mode=AUTO", "mode=CAS", "line=2"], None, None, None, None, None)
+    assert options["where"] == {"mode": ["AUTO", "CAS"], "line": "2"}
+    with pytest.raises(typer.BadParameter, match="'h1' is given twice, 'LI' and 'PI'"):
+        pairs("--column", ["h1=LI", "h1=PI"])

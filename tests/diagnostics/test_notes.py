@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpcoffline import MPC, Model, QuadraticCost, Signal, TransitionTable
 from mpcoffline.control.policy import MPCPolicy
+from mpcoffline.diagnostics.limits import LimitCheck
 from mpcoffline.diagnostics.measures import GoalCheck, ValueCheck, goal_check, value_check
 from mpcoffline.diagnostics.notes import Fit, notes_on
 from mpcoffline.diagnostics.report import PredictionCheck, Report
@@ -43,6 +44,7 @@ def notes(fit: Fit = FIT, **changes: Any) -> tuple[str, ...]:
         "value": ValueCheck(100, 0.9, 0.0, 0.0, 0.9),
         "prediction": PredictionCheck(0.5, 0.1, 0.1, ()),
         "at_bounds": (),
+        "limits": (LimitCheck("level", "hard", (0.0, 0.0, 0.04), (0.0, 0.0, 0.1), False),),
         "theorem": TheoremCheck(1.0, 0.0, (0.9, 0.2)),
         "weights": (WeightCheck("W", (0.1, 1.0), (0.1, 1.0)),),
     }
@@ -51,6 +53,17 @@ def notes(fit: Fit = FIT, **changes: Any) -> tuple[str, ...]:
 
 def test_nothing_is_said_of_a_report_without_a_fault() -> None:
     assert notes() == ()
+
+
+def test_a_plan_that_lives_beyond_its_limits_is_offered_a_margin() -> None:
+    """Also where MPC_1 violates them as often, so that the verdict says nothing of it."""
+    limits = [
+        LimitCheck(name, "l1 = 50", (0.1, 0.8, share), (1, 2, 2), False) for name, share in (("p", 0.3), ("c", 0))
+    ]
+    (said,) = notes(limits=limits)
+    assert said.startswith("The learned MPC violates 'p' in 30% of its steps")
+    assert "--keep-limits" in said
+    assert notes(Fit(smoothed=True, model=True, value=True, learned=False), limits=limits) == ()
 
 
 def log_of(states: Array, nu: int = 1) -> TransitionTable:

@@ -186,7 +186,7 @@ def test_what_does_not_fit_is_told_by_name_and_line(changes: dict[str, Any], mes
         (lambda: State("h1", "cm", 0, 1, start=2), "state h1: start: expected a number"),
         (lambda: Input("u", "V", 0, 1, rate=0), "input u: rate: expected a finite number above 0"),
         (lambda: Input("u", "V", 0, 1, delay=-1), "input u: delay: expected an integer >= 0"),
-        (lambda: Limit("l", "h1"), "limit 'l': expected low <= high, one of them"),
+        (lambda: Limit("l", "h1"), "limit 'l': expected low=, high= or both, got no bound. .* write high=0"),
         (lambda: Limit("l", 3), "limit 'l': expected the name of a state"),  # type: ignore[arg-type]
         (lambda: Limit("l", "h1", high="1"), "limit 'l': bounds: expected two numbers, got '1'"),  # type: ignore[arg-type]
         (lambda: Limit("l", "h1", high=float("nan")), "limit 'l': expected low <= high"),

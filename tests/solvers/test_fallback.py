@@ -76,6 +76,18 @@ def test_the_best_plan_is_applied_by_a_cold_solve_and_clipped(
     assert told == ["An MPC was not solved (word): applying the best plan found."]
 
 
+@pytest.mark.parametrize(("level", "n"), [(logging.WARNING, 1), (logging.INFO, 0)])
+def test_what_a_simulated_controller_cannot_solve_is_no_warning(
+    level: int, n: int, scripted: MPCPolicy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    answering(monkeypatch, lambda x, warm: (x, 1.0, False))
+    scripted.retry_at_most(1.0, level)
+    with caplog.at_level(logging.WARNING):
+        scripted.predict([[0.3, 0.0]])
+    assert sum("was not solved" in record.getMessage() for record in caplog.records) == n
+    assert answers(scripted.solver_stats) == {"best_plan": 1}
+
+
 def test_a_warm_failure_is_tried_once_from_all_starts_and_it_alone(
     scripted: MPCPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,12 +10,12 @@ import pytest
 from planted_logs import Case, changed, defects, found_in, heater, is_named, logged
 from typer.testing import CliRunner
 
-from mpcoffline import Input, Plant, State
+from mpcoffline import Input, Plant, Signal, State
 from mpcoffline.cli import app
 from mpcoffline.cli.own_plants import _show
 from mpcoffline.core.tables import Table
 from mpcoffline.tune import LogCheck, check_log
-from mpcoffline.tune.covered import gain
+from mpcoffline.tune.covered import coverage, gain, readable
 from mpcoffline.tune.determined import _long
 from mpcoffline.tune.experiment import experiments
 
@@ -44,6 +44,40 @@ QUICK = ("dead time of 1 step", "another sampling time", "state and input exchan
 def test_a_planted_defect_is_named(case: Case) -> None:
     problems, advice = found_in(case)
     assert is_named(case, problems, advice), (problems, advice)
+
+
+@pytest.mark.parametrize(
+    ("first", "after", "kind"), [(60, 150, "problem"), (60, 90, "advice"), (1170, 1200, "problem")]
+)
+def test_a_sensor_that_was_stuck_for_a_while_is_left_out_and_no_reason_to_wait(
+    first: int, after: int, kind: str
+) -> None:
+    """A fortieth of the log is an incident; a twentieth of it, or to its end, something to mend."""
+    plant, found = heater(), LogCheck()
+    log = {name: np.tile(column, 4) for name, column in LOG.items()} | {"time": 5.0 * np.arange(1200)}
+    log["T"][first:after] = log["T"][first]
+    readable(plant.read(log), found)
+    (remark,) = found.remarks
+    assert (remark.kind, "stuck at" in remark.text) == (kind, True)
+    assert ("to the log's end" in remark.text) == (after == 1200)
+
+
+def test_what_the_log_covers_leaves_out_previews_and_clocks() -> None:
+    plant = Plant(
+        "store",
+        dt=3600.0,
+        states=[State("level", "kWh", 0, 10)],
+        inputs=[Input("power", "kW", -1, 1)],
+        signals=[Signal("day", period=24), Signal("price", "EUR/kWh", low=0, high=1, preview=12)],
+        dynamics=lambda x, u: [u.power / 3600],
+        cost=lambda x, u, d: d.price * u.power,
+    )
+    rng, found = np.random.default_rng(0), LogCheck()
+    log = {"time": 3600.0 * np.arange(300), "level": 5 + rng.normal(size=300), "power": rng.choice([-1, 1], 300)}
+    coverage(plant, plant.read(log | {"price": rng.choice([0.25, 0.75], 300)}), found)
+    (covered,) = found.tables
+    assert [row[0] for row in covered.rows] == ["level [kWh]", "price [EUR/kWh]", "power [kW]"]
+    assert [row[-1] for row in covered.rows[1:]] == ["50%", "100%"]
 
 
 def test_a_sound_log_is_worth_tuning_and_the_page_says_what_it_determines() -> None:

@@ -141,6 +141,26 @@ def test_a_damaged_table_is_refused(once: Tuned, tmp_path: Path) -> None:
         Tuned.load(tmp_path)
 
 
+def test_the_command_hands_on_in_which_share_limits_are_to_be_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, log = tmp_path / "heater.py", tmp_path / "log.csv"
+    file.write_text("from planted_logs import heater\nplant = heater()\n")
+    log.write_text("power,T,ambient\n" + "\n".join(f"{20 + 5 * (i % 7)},{30 + i % 5},20" for i in range(30)))
+    given: list[dict[str, Any]] = []
+
+    def stand_in(plant: Any, table: Any, out: Path, **options: Any) -> Tuned:
+        given.append(options)
+        raise InvalidArgumentError("stand-in", expected="no more", actual="enough")
+
+    monkeypatch.setattr("mpcoffline.tune.tune", stand_in)
+    command = ["tune", str(file), str(log)]
+    assert CliRunner().invoke(app, command).exit_code == 1
+    assert CliRunner().invoke(app, [*command, "--keep-limits", "0.95"]).exit_code == 1
+    assert CliRunner().invoke(app, [*command, "--keep-limits", "1.5"]).exit_code == 2
+    assert [options.get("keep_limits") for options in given] == [None, 0.95]
+
+
 def test_the_command_tells_what_it_does_and_ends_with_what_to_do(
     once: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,7 @@ from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.types import Array
 
 from .columns import Column, Quantity, allowed, found, place_of
+from .modes import Modes
 from .report import LogReport
 from .sources import Source, opened
 from .times import NAMES, Clock, in_zone, without_set_back
@@ -34,7 +35,7 @@ class Options:
         time_format: How stamps are written, as ``"%d.%m.%Y %H:%M"``.
         timezone: Of stamps without offset, as ``"Europe/Berlin"``.
         episode: Header of what tells episodes apart.
-        where: Values of further columns that rows must have, as ``{"mode": "AUTO"}``.
+        where: Values of further columns that rows must have, as ``{"mode": "AUTO"}``; of several, one.
         max_gap: Seconds between rows beyond which a new episode begins.
     """
 
@@ -92,6 +93,7 @@ class _Parts:
     absolute: bool = True
     zoned: bool = False
     unitless: bool = True
+    modes: Modes = field(default_factory=Modes)
 
 
 def collected(
@@ -114,6 +116,7 @@ def collected(
         with opened(each) as source:
             _collect(source, quantities, dt, options, report, parts)
     report.rows = parts.rows
+    report.note(*parts.modes.notes)
     _days(parts, dt, report)
     t, kept = np.concatenate(parts.times), np.concatenate(parts.kept)
     parts.times.clear()
@@ -160,6 +163,8 @@ def _collect(
     places = [(place_of(source, name, name)[0], values) for name, values in options.where.items()]
     episode = None if options.episode is None else place_of(source, options.episode, options.episode)[0]
     parts.files.append((parts.rows, source))
+    read = {each.found.place for each in columns.values()} | {*stamps, *(place for place, _ in places)}
+    read |= set() if episode is None else {episode}
     rows = 0
     for frame in source.frames:
         for column in columns.values():
@@ -173,6 +178,7 @@ def _collect(
             several = values if isinstance(values, list | tuple | set) else [values]
             kept &= allowed(frame[str(place)], list(several))
         parts.kept.append(kept)
+        parts.modes.add(source.header, frame, read)
         if episode is not None:
             parts.episodes.append(np.asarray(frame[str(episode)].cast(str).to_numpy(), dtype=object))
         rows += len(frame)
@@ -300,4 +306,5 @@ def _ordered(t: Array, lost: NDArray[np.bool_], parts: _Parts, report: LogReport
 
 
 def _worded(where: Mapping[str, Any]) -> str:
-    return " and ".join(f"{name} = {value}" for name, value in where.items())
+    several = {name: v if isinstance(v, list | tuple | set) else [v] for name, v in where.items()}
+    return " and ".join(f"{name} = {' or '.join(map(str, values))}" for name, values in several.items())

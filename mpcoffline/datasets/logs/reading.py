@@ -174,7 +174,8 @@ def _free_of_stuck(rows: Rows, each: Quantity, v: Array, others: list[Array], re
     finite = [np.nan_to_num(other) for other in others]
     for a, e in faults.stuck(v, finite):
         if np.isfinite(v[a]):
-            report.leave_out(each.name, f"stuck at {v[a]:g} while others move", e - a, rows.place(a))
+            why, lasting = f"stuck at {v[a]:g} while others move", e == len(v)
+            report.leave_out(each.name, why, e - a, rows.place(a), lasting=lasting)
             rows.blocked[a:e] = True
 
 

@@ -17,12 +17,14 @@ class LeftOut:
         why: The reason.
         count: How many.
         first: The first of them, as ``"log.csv, line 17"``.
+        lasting: Whether it is still so in the log's last row.
     """
 
     what: str
     why: str
     count: int
     first: str
+    lasting: bool = False
 
 
 @dataclass
@@ -45,10 +47,10 @@ class LogReport:
     left_out: list[LeftOut] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def leave_out(self, what: str, why: str, count: int, first: str) -> None:
+    def leave_out(self, what: str, why: str, count: int, first: str, *, lasting: bool = False) -> None:
         """Enters what was left out, if there is any."""
         if count:
-            self.left_out.append(LeftOut(what, why, int(count), first))
+            self.left_out.append(LeftOut(what, why, int(count), first, lasting))
 
     def note(self, *texts: str) -> None:
         """Enters what was found out, once."""

@@ -11,6 +11,31 @@ from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 EXTRA = 'pip install "mpcoffline[logs]"'
 
 _BRACKETS = re.compile(r"^(?P<name>.*?\S)\s*[\[({<](?P<unit>[^\])}>]*)[\])}>]\s*$")
+#: Currencies, each a kind of its own: none becomes another. The cent is a hundredth of whichever the other side has.
+_CURRENCIES = (
+    "EUR", "USD", "GBP", "CHF", "SEK", "NOK", "DKK", "PLN", "CZK", "HUF", "JPY", "CNY", "INR", "AUD", "CAD", "BRL",
+    "ZAR",
+)  # fmt: skip
+_SIGNS = {"€": "EUR", "$": "USD", "£": "GBP", "¥": "JPY"}
+_CENT = re.compile(r"(?<![A-Za-z])(?:ct|cents?|Cents?|¢)(?=\s*/|\s*$)")
+#: As instruments and historians write what pint spells otherwise, as a whole and as words within.
+_WHOLE = {
+    "U/min": "rpm", "Upm": "rpm", "Grad C": "degC", "Grad F": "degF", "DegC": "degC", "DegF": "degF", "VDC": "V",
+    "VAC": "V", "% r.H.": "%", "% rH": "%", "%rH": "%", "%RH": "%", "vol%": "%", "vol.%": "%", "Vol.-%": "%",
+    "Vol%": "%", "wt%": "%", "wt.%": "%", "Gew.-%": "%", "Prozent": "%", "perc": "%",
+}  # fmt: skip
+_WORDS = {
+    "RPM": "rpm",
+    "gpm": "gallon/minute",
+    "sccm": "cm**3/minute",
+    "Std": "hour",
+    "Sek": "second",
+    "mmH2O": "millimeter_H2O",
+}
+_WORD = re.compile(r"((?<![A-Za-z])(RPM|gpm|sccm|mmH2O)|(?<=/)(Std|Sek))(?![A-Za-z])")  # T_Std is no time
+_DEGREES = {"C": "degC", "F": "degF"}  # alone, they are units of charge and capacity
+_PRESSURE = re.compile(r"^((?:[mk]|h)?(?:bar|Pa)|MPa|psi)\s*[_(]?([ga])\)?$")  # gauge or absolute
+_ANGLE = re.compile(r"rad|deg|°|turn|rev|rp[ms]|U/|Upm", re.IGNORECASE)
 _IN = re.compile(r"^(?P<name>.*?\S)\s+in\s+(?P<unit>\S+)$", re.IGNORECASE)
 
 
@@ -41,13 +66,21 @@ def _registry() -> Any:
         import pint
     except ImportError as error:
         raise InvalidArgumentError("units", expected="the package pint", actual="not installed", hint=EXTRA) from error
-    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry: Any = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry.define("millimeter_H2O = 0.1 * centimeter_H2O")
+    for each in _CURRENCIES:
+        registry.define(f"{each} = [{each}]")
+        registry.define(f"cent_{each} = 0.01 {each}")
+    return registry
 
 
 @cache
 def _unit(text: str) -> Any:
     """Pint's unit of a text; None where it knows none. ``cm2`` and ``cm^2`` are ``cm**2``."""
-    plain = re.sub(r"(?<=[A-Za-zµ])(-?\d)", r"**\1", text.replace("^", "**").replace("·", "*").replace("Ω", "ohm"))
+    text = _WORD.sub(lambda word: _WORDS[word[0]], _WHOLE.get(text, text))
+    plain = re.sub(
+        r"(?<=[A-Za-zµ])(-?\d)(?![A-Za-z\d])", r"**\1", text.replace("^", "**").replace("·", "*").replace("Ω", "ohm")
+    )
     try:
         return _registry().Unit(plain)
     except InvalidArgumentError:
@@ -59,6 +92,28 @@ def _unit(text: str) -> Any:
 def is_unit(text: str) -> bool:
     """Whether a text is a unit."""
     return _unit(text) is not None
+
+
+def _meant(given: str, wanted: str) -> list[str]:
+    """Two units, each as the other shows that it is meant: degrees, kinds of pressure, money."""
+    texts = [given, wanted]
+    for i, other in enumerate((wanted, given)):
+        unit = _unit(other)
+        if texts[i] in _DEGREES and unit is not None and unit.dimensionality == _registry().Unit("K").dimensionality:
+            texts[i] = _DEGREES[texts[i]]
+        if _WHOLE.get(texts[i], texts[i]).casefold() == "rpm" and not _ANGLE.search(other):
+            texts[i] = "1/minute"  # pint's has 2 pi in it, which is right beside rad/s alone
+    kinds = [_PRESSURE.match(text) for text in texts]
+    return _money(*(kind[1] if kind else text for kind, text in zip(kinds, texts, strict=True)))
+
+
+def _money(*texts: str) -> list[str]:
+    """Units with their currencies by code; cents as hundredths of the currency that one of them names, else of EUR."""
+    plain = [re.sub("[€$£¥]", lambda sign: _SIGNS[sign[0]], text) for text in texts]
+    named = [each for each in _CURRENCIES if any(re.search(rf"(?<![A-Za-z_]){each}\b", text) for text in plain)]
+    cent = f"cent_{named[0] if named else 'EUR'}"
+    is_money = bool(named) or all(_CENT.search(text) for text in plain)  # "ct" alone may be carats
+    return [_CENT.sub(cent, text) for text in plain] if is_money else plain
 
 
 def conversion(where: str, given: str | None, wanted: str) -> tuple[float, float]:
@@ -74,11 +129,18 @@ def conversion(where: str, given: str | None, wanted: str) -> tuple[float, float
     """
     if not given or not wanted or given == wanted:
         return 1.0, 0.0
+    kinds = {kind[2] for kind in map(_PRESSURE.match, (given, wanted)) if kind}
+    if len(kinds) > 1:
+        hint = "They differ by the pressure of the air: write the sum into the log or into the plant file's equations."
+        raise InvalidDataError(f"{where}: unit", expected=f"{wanted}, as in the plant file", actual=given, hint=hint)
     units = []
-    for text in (given, wanted):
-        unit = _unit(text)
+    for text, worded in zip((given, wanted), _meant(given, wanted), strict=True):
+        unit = _unit(worded)
         if unit is None:
-            hint = "Give it in another spelling: units={...}."
+            hint = (
+                "Where both are the same unit, write it alike; else units={...} says the log's in another spelling, as"
+                " 'm**3/h', 'degC', 'EUR/MWh' (--unit)."
+            )
             raise InvalidDataError(f"{where}: unit", expected="one that is known", actual=repr(text), hint=hint)
         units.append(unit)
     quantity = _registry().Quantity

@@ -509,3 +509,25 @@ def test_what_is_no_log_is_refused(plant: Plant, tmp_path: Path) -> None:
         plant.read({"h1": [1.0]}, max_gap=1.0)
     for error in (InvalidArgumentError, InvalidDataError, StorageError):
         assert issubclass(error, MPCOfflineError)
+
+
+def test_a_column_of_few_words_that_nothing_reads_is_named_with_how_to_choose_by_it(plant: Plant) -> None:
+    names = ("t", "h1", "h2", "pump", "set_point")
+    frame = dict(zip(names, LOG, strict=True))
+    n = len(LOG.t)
+    modes = ["MAN" if i < n // 4 else "AUTO" for i in range(n)]
+    others = {
+        "operation mode": modes,
+        "operator": [f"shift {i}" for i in range(n)],
+        "count": [f"{i % 3}" for i in range(n)],
+        "alarm": ["high" if i < n // 4 else "" for i in range(n)],
+        "site": ["north"] * n,
+    }
+    (said,) = (note for note in plant.read(frame | others).report.notes if "is not used" in note)
+    share = modes.count("AUTO") / n
+    assert said.startswith(
+        f"column 'operation mode' is not used: 'AUTO' in {share:.1%}, 'MAN' in {1 - share:.1%} of the"
+    )
+    assert "--where 'operation mode=AUTO'" in said
+    chosen = plant.read(frame | others, where={"operation mode": "AUTO"})
+    assert not any("is not used" in note for note in chosen.report.notes)
