@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from mpcoffline.core.errors import InvalidArgumentError
+
 from .common import check_out, examples, loaded_policy, made_environment, print_json, say, say_file
 from .options import Controller, Json, PlantAlpha, Seed, beginning, dataset_ids, environments
 
@@ -42,7 +44,7 @@ def distill(
     ] = None,
     out: Annotated[Path, typer.Option(help="File for the explicit policy.", dir_okay=False)] = Path("distilled.zip"),
     multiply_adds: Annotated[int, typer.Option(help="The most that an action may take.", min=1)] = 2000,
-    labels: Annotated[int, typer.Option(help="MPCs that are solved as examples, about.", min=1)] = 60_000,
+    labels: Annotated[int, typer.Option(help="MPCs that are solved as examples, about.", min=1)] = 40_000,
     seed: Seed = 0,
     alpha: PlantAlpha = None,
     as_json: Json = False,
@@ -55,6 +57,8 @@ def distill(
     `mpcoffline evaluate` runs the file, `mpcoffline export` writes it as C99 or ONNX.
     """
     check_out("--out", out, make=False)
+    if data is None and env is None:
+        raise InvalidArgumentError("--data", expected="a data set, or an environment by --env", actual="neither")
     target = None if env is None else made_environment(env, alpha, None)
     controller = loaded_policy(policy)
     from mpcoffline.control.explicit.distilling import distill as distilled

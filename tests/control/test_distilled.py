@@ -231,6 +231,7 @@ def test_loss_is_measured_from_the_floor() -> None:
     assert Comparison.of([0.0], [0.0], 5).loss == 0.0
 
 
+@pytest.mark.interop
 def test_onnx_is_the_policy_and_v(tmp_path: Path) -> None:
     """By onnxruntime where it is installed (scripts/test_interop), else by onnx's own reference."""
     pytest.importorskip("onnx")

@@ -64,7 +64,7 @@ def distill(
     multiply_adds: int = MULTIPLY_ADDS,
     hidden: Sequence[int] | None = None,
     n_steps: int | None = None,
-    n_labels: int = 60_000,
+    n_labels: int = 40_000,
     rounds: int = 4,
     effort: float = 1.0,
     progress: bool = False,
