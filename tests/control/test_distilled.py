@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,7 @@ from riccati import optimum
 from stable_baselines3.common.evaluation import evaluate_policy
 from task_ids import LINEAR
 
-import mpcoffline
+import mpcoffline.envs  # noqa: F401 -- registers the tasks
 from mpcoffline import MPCPolicy
 from mpcoffline.control import DistilledPolicy, OutputFeedbackPolicy, distill
 from mpcoffline.control.explicit.code import export_explicit_c
@@ -31,7 +32,6 @@ from mpcoffline.estimation import KalmanObserver
 from mpcoffline.learning import ValueFunction
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.mpc.labels import Label
-from mpcoffline.plants.nominal import nominal_mpc
 from mpcoffline.solvers.ddp.build import find_compiler
 
 FAST = {"n_labels": 1500, "rounds": 2, "effort": 0.1}
@@ -82,21 +82,21 @@ def test_of_a_linear_regulator_it_is_the_riccati_gain() -> None:
 
 
 def test_it_costs_hardly_more_than_the_mpc_and_is_alike_for_a_seed() -> None:
-    policy = MPCPolicy(nominal_mpc(LINEAR).replace(horizon=20))
-    found = [policy.distill("mpcoffline/linear/ddpg-v0", env=LINEAR, seed=3, **FAST) for _ in range(2)]
-    assert found[0].report == found[1].report
-    assert all((a == b).all() for a, b in zip(found[0].network.weights, found[1].network.weights, strict=True))
+    policy = MPCPolicy(double_integrator(0.5))
+    starts = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
+    found = [policy.distill(starts, seed=3, hidden=(8, 8), **FAST) for _ in range(2)]
     report = found[0].report
-    assert report.multiply_adds <= 2000
+    assert report == found[1].report
+    assert all((a == b).all() for a, b in zip(found[0].network.weights, found[1].network.weights, strict=True))
+    assert report.multiply_adds == found[0].network.multiply_adds
+    assert report.n_labels <= 1.1 * FAST["n_labels"]
     assert abs(report.model.loss) < 0.02
-    assert report.env is not None
-    assert abs(report.env.loss) < 0.02
-    env = mpcoffline.envs.LinearTrackingEnv()
-    own = mpcoffline.evaluate(found[0], LINEAR, 100, 3)
-    assert own.cost.mean() == pytest.approx(report.env.cost)
-    mean, _ = evaluate_policy(found[0], env, n_eval_episodes=2)
-    assert np.isfinite(mean)
     assert "multiply-adds an action" in str(report)
+
+
+def test_it_acts_where_an_sb3_policy_does() -> None:
+    mean, _ = evaluate_policy(made_up(4, 2), gym.make(LINEAR), n_eval_episodes=1, warn=False)
+    assert np.isfinite(mean)
 
 
 def test_inputs_stay_within_their_bounds() -> None:
