@@ -37,11 +37,13 @@ from mpcoffline.solvers.ddp.build import find_compiler
 FAST = {"n_labels": 1500, "rounds": 2, "effort": 0.1}
 
 
-def made_up(ny: int = 3, nu: int = 2, memory: int = 0, hidden: tuple[int, ...] = (38, 38)) -> DistilledPolicy:
+def made_up(
+    ny: int = 3, nu: int = 2, memory: int = 0, hidden: tuple[int, ...] = (38, 38), offset: float = 1e4
+) -> DistilledPolicy:
     """A policy of random weights that sees columns far from zero, one input of it without an upper bound."""
     rng = np.random.default_rng(0)
     nz = ny + memory
-    states = rng.normal(size=(50, nz)) * np.geomspace(1e-3, 1e3, nz) + np.linspace(0.0, 1e4, nz)
+    states = rng.normal(size=(50, nz)) * np.geomspace(1e-3, 1e3, nz) + np.linspace(0.0, offset, nz)
     low, high = np.full(nu, -1.5), np.append(np.full(nu - 1, 2.5), np.inf)
     network = PolicyNetwork.random(states, (low, high), rng.normal(size=(50, nu)), hidden, rng)
     last = 10.0 * network.weights[-1]
@@ -101,7 +103,8 @@ def test_it_acts_where_an_sb3_policy_does() -> None:
 
 def test_inputs_stay_within_their_bounds() -> None:
     policy = made_up()
-    wild = policy.network.mean + 1e3 * policy.network.spread * np.random.default_rng(1).normal(size=(500, 3))
+    sizes = np.geomspace(0.1, 1e3, 500)[:, None]
+    wild = policy.network.mean + sizes * policy.network.spread * np.random.default_rng(1).normal(size=(500, 3))
     actions, state = policy.predict(wild)
     assert state is None
     assert (actions >= policy.action_space.low).all()
@@ -160,7 +163,8 @@ def test_damaged_arrays_are_refused(name: str, array: np.ndarray) -> None:
 @pytest.mark.parametrize("memory", [0, 2])
 @pytest.mark.parametrize("flags", [(), ("-DPOLICY_FLOAT",)])
 def test_the_c_code_passes_its_test(memory: int, flags: tuple[str, ...], tmp_path: Path) -> None:
-    files = export_explicit_c(made_up(memory=memory), tmp_path)
+    # A float has no digits left for a column of small changes far from zero.
+    files = export_explicit_c(made_up(memory=memory, offset=0.0 if flags else 1e4), tmp_path)
     assert {file.name for file in files} >= {"explicit_policy.c", "explicit_policy.h", "CMakeLists.txt"}
     sources = [tmp_path / "explicit_policy.c", tmp_path / "explicit_test.c"]
     strict = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -186,7 +190,9 @@ def test_an_input_at_its_bound_asks_for_no_more_than_that() -> None:
     actions = np.clip(2.0 * states, -1.0, 1.0)
     network = PolicyNetwork.random(states, (np.array([-1.0]), np.array([1.0])), actions, (2,), rng)
     fitted = fit_policy(network, states, actions, n_steps=100, n_refined=100, seed=0)
-    np.testing.assert_allclose(fitted(states), actions, atol=1e-3)
+    off = fitted(states) - actions
+    assert np.sqrt(np.mean(off**2)) < 1e-3
+    assert np.abs(off).max() < 1e-2
 
 
 def test_multiply_adds_are_counted() -> None:
