@@ -38,6 +38,7 @@ from .others import AddedCommand, added_commands
 if TYPE_CHECKING:
     from gymnasium import Env
 
+    from mpcoffline.control.explicit.policy import DistilledPolicy
     from mpcoffline.control.loading import Acting
     from mpcoffline.learner.learner import OfflineMPCLearner
 
@@ -213,6 +214,18 @@ def loaded_policy(path: Path) -> Acting:
         from mpcoffline.control.loading import load_policy
 
         return load_policy(path)
+
+
+def loaded_actor(path: Path) -> Acting | DistilledPolicy:
+    """The policy in a file: an MPC's, a learner's, or an explicit one."""
+    with working("Loading"):
+        from mpcoffline.core.archive import holds, with_ending
+
+        if holds(with_ending(path), "distilled"):
+            from mpcoffline.control.explicit.policy import DistilledPolicy
+
+            return DistilledPolicy.load(path)
+    return loaded_policy(path)
 
 
 def loaded_learner(path: Path) -> OfflineMPCLearner:

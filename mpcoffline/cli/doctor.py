@@ -25,6 +25,7 @@ _OPTIONAL = {
     "huggingface_hub": ("data sets on hf://", "hub"),
     "google-cloud-storage": ("data sets on gcp://", "gcs"),
     "torchrl": ("to_torchrl", "interop"),
+    "onnx": ("export --to onnx", "onnx"),
     "imageio-ffmpeg": ("films as MP4", "video"),
 }
 _ALTERNATIVES = {"pygame": ("pygame-ce",)}

@@ -8,11 +8,14 @@ import typer
 
 from mpcoffline.core.tables import Table
 
-from .common import console, examples, loaded_policy, made_environment, print_json, working
+from .common import console, examples, loaded_actor, made_environment, print_json, working
 from .options import Controller, Json, PlantAlpha, Start, beginning, environments
 
 if TYPE_CHECKING:
     from mpcoffline.control.evaluation import Evaluation
+    from mpcoffline.control.explicit.policy import DistilledPolicy
+    from mpcoffline.control.loading import Acting
+    from mpcoffline.solvers.fallback import SolverStats
 
 app = typer.Typer()
 
@@ -23,6 +26,7 @@ app = typer.Typer()
         "mpcoffline evaluate learner.zip --env mpcoffline/CartPoleSwingUp-v0 --episodes 10 --start hanging",
         "mpcoffline evaluate tuned/policy.zip --env two_tank.py",
         "mpcoffline evaluate learner.zip --env mpcoffline/LinearTracking-v0 --json",
+        "mpcoffline evaluate distilled.zip --env mpcoffline/PendulumSwingUp-v0",
     )
 )
 def evaluate(
@@ -46,30 +50,49 @@ def evaluate(
     import mpcoffline
 
     target = made_environment(env, alpha, None if start is None else start.value)
-    controller = loaded_policy(policy)
+    controller = loaded_actor(policy)
     options = None if start is None else {"start": start.value}
+    discount = _discount(controller)
     with working("Closed loops"):
-        result = mpcoffline.evaluate(
-            controller, target, episodes, seed, discount=controller.mpc.discount, options=options
-        )
-    stats = controller.solver_stats
+        result = mpcoffline.evaluate(controller, target, episodes, seed, discount=discount, options=options)
+    stats = getattr(controller, "solver_stats", None)  # an explicit policy solves nothing
     if as_json:
+        solves = {} if stats is None else _solves(stats)
         print_json(
             {"policy": policy, "env": env, "episodes": episodes, "seed": seed, "start": start, "alpha": alpha}
             | _figures(result)
-            | {"n_solves": stats.n_solves, "n_failures": stats.n_failures, "solve_time": stats.time / stats.n_solves}
-            | {"failures": stats.answers}
+            | solves
         )
         return
     costs = ("cost J", result.cost), (f"discounted cost ({result.discount:g})", result.discounted_cost)
     rows = [
         *((label, f"{c.mean():.2f}", f"{c.min():.2f}", f"{c.max():.2f}") for label, c in costs),
         *([("success", f"{result.success.mean():.0%}")] if result.knows_success else []),
-        ("time of a solve (ms)", f"{1e3 * stats.time / stats.n_solves:.2f}"),
-        ("failed solves", stats.failures),
     ]
+    if stats is not None:
+        rows += [
+            ("time of a solve (ms)", f"{1e3 * stats.time / stats.n_solves:.2f}"),
+            ("failed solves", stats.failures),
+        ]
     title = f"{policy.name} in {env}, {episodes} episodes"
     console.print(Table(("", "mean", "best", "worst"), rows, title, "lr"))
+
+
+def _discount(controller: Acting | DistilledPolicy) -> float:
+    """The MPC's discount, or that of the MPC that was distilled."""
+    from mpcoffline.control.explicit.policy import DistilledPolicy
+
+    return controller.report.discount if isinstance(controller, DistilledPolicy) else controller.mpc.discount
+
+
+def _solves(stats: SolverStats) -> dict[str, Any]:
+    """How the solves went, for machines."""
+    return {
+        "n_solves": stats.n_solves,
+        "n_failures": stats.n_failures,
+        "solve_time": stats.time / stats.n_solves,
+        "failures": stats.answers,
+    }
 
 
 def _figures(result: Evaluation) -> dict[str, Any]:

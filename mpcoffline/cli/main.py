@@ -8,6 +8,7 @@ import typer
 
 from . import (
     datasets as cli_datasets,
+    distilling as cli_distilling,
     evaluate as cli_evaluate,
     figures as cli_figures,
     learn as cli_learn,
@@ -51,6 +52,9 @@ def main(
     progress_to_stderr()
 
 
-for commands in (cli_run, cli_own_plants, cli_tuning, cli_serving, cli_learn, cli_evaluate, cli_figures, cli_tools):
+for commands in (
+    *(cli_run, cli_own_plants, cli_tuning, cli_serving, cli_learn, cli_evaluate, cli_figures),
+    *(cli_distilling, cli_tools),
+):
     app.add_typer(commands.app)
 app.add_typer(cli_datasets.app, name="datasets")

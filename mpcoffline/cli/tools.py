@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from .common import examples, loaded_policy, print_json, say, say_file, working
+from .common import examples, loaded_actor, loaded_policy, print_json, say, say_file, working
 from .options import Controller, Json
 
 app = typer.Typer()
@@ -23,38 +23,63 @@ class Target(StrEnum):
 
     c = "c"
     do_mpc = "do-mpc"
+    casadi = "casadi"
+    onnx = "onnx"
 
 
 @app.command(
     epilog=examples(
         "mpcoffline export learner_policy.zip --out controller/",
         "mpcoffline export learner_policy.zip --to do-mpc --out controller/",
+        "mpcoffline export learner_policy.zip --to casadi --out controller/",
+        "mpcoffline export distilled.zip --to c --out controller/",
+        "mpcoffline export learner.zip --to onnx --out controller/",
     )
 )
 def export(
     policy: Controller,
-    to: Annotated[Target, typer.Option(help="C99, or a script for do-mpc.")] = Target.c,
+    to: Annotated[
+        Target, typer.Option(help="C99, a script for do-mpc, CasADi's files of the problem, or ONNX.")
+    ] = Target.c,
     out: Annotated[Path, typer.Option(help="Folder for the files.", file_okay=False)] = Path("controller"),
 ) -> None:
     """Write a policy as self-contained C99: no allocation, no dependency, a fixed budget of iterations.
 
     The folder receives the controller, a header with names and units of the parameters, a CMake file, and a test that
-    compares it with this package's solutions. A policy that sees outputs comes with its observer.
+    compares it with this package's solutions. A policy that sees outputs comes with its observer. The C of an explicit
+    policy, as `mpcoffline distill` makes it, is below 20 kB.
 
     With `--to do-mpc`: a script for do-mpc that makes the same controller, and its functions as CasADi's files.
+
+    With `--to casadi`: model, costs and the whole nonlinear program as CasADi's files, and a script that solves it.
+
+    With `--to onnx`: an explicit policy, or of a learner its value function V.
     """
-    controller = loaded_policy(policy)
     with working(f"Writing {to.value}"):
-        if to is Target.c:
-            from mpcoffline.control.export import export_c
-
-            paths = export_c(controller, out)
-        else:
-            from mpcoffline.control.export_do_mpc import export_do_mpc
-
-            paths = export_do_mpc(controller, out)
+        paths = _exported(policy, to, out)
     for path in paths:
         say_file(to.value, path)
+
+
+def _exported(policy: Path, to: Target, out: Path) -> list[Path]:
+    """The files written."""
+    if to is Target.onnx:
+        from mpcoffline.control.export_onnx import export_onnx
+
+        return export_onnx(policy, out)
+    if to is Target.c:
+        from mpcoffline.control.explicit.code import export_explicit_c
+        from mpcoffline.control.explicit.policy import DistilledPolicy
+        from mpcoffline.control.export import export_c
+
+        controller = loaded_actor(policy)
+        if isinstance(controller, DistilledPolicy):
+            return export_explicit_c(controller, out)
+        return export_c(controller, out)
+    from mpcoffline.control.export_casadi import export_casadi
+    from mpcoffline.control.export_do_mpc import export_do_mpc
+
+    return (export_do_mpc if to is Target.do_mpc else export_casadi)(loaded_policy(policy), out)
 
 
 class Waste(StrEnum):

@@ -6,6 +6,7 @@ from os import PathLike
 from typing import Any
 
 from mpcoffline.core.archive import holds, with_ending
+from mpcoffline.core.errors import FileFormatError
 
 from .output_feedback import OutputFeedbackPolicy
 from .policy import MPCPolicy
@@ -26,5 +27,12 @@ def load_policy(path: str | PathLike[str], **solver_options: Any) -> Acting:
         InvalidArgumentError: For an option that the solver has not.
         MPCOfflineError: For a learner that has not learned.
     """
-    kind = OutputFeedbackPolicy if holds(with_ending(path), "output_feedback") else MPCPolicy
+    if holds(file := with_ending(path), "distilled"):
+        raise FileFormatError(
+            str(path),
+            expected="an MPC",
+            actual="an explicit policy, which was distilled from one",
+            hint="DistilledPolicy.load reads it; `mpcoffline evaluate` and `export --to c|onnx` take it.",
+        )
+    kind = OutputFeedbackPolicy if holds(file, "output_feedback") else MPCPolicy
     return kind.load(path, **solver_options)

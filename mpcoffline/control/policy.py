@@ -35,7 +35,9 @@ from mpcoffline.solvers.fallback import Fallback, SolverStats
 from mpcoffline.solvers.options import OF_THE_MACHINE
 
 from .course import Course, course_from
-from .observations import checked_observation
+from .explicit.distilling import distill
+from .explicit.policy import DistilledPolicy
+from .observations import checked_observation, spaces_of
 
 logger = logging.getLogger(__name__)
 
@@ -102,18 +104,7 @@ class MPCPolicy(BasePolicy):
         rescue_time: float = 1.0,
         **solver_options: Any,
     ) -> None:
-        if observation_space is None:
-            observation_space = spaces.Box(-np.inf, np.inf, (mpc.ny,), np.float32)
-        if action_space is None:
-            with np.errstate(over="ignore"):  # a bound beyond float32 is none
-                low, high = (np.asarray(bound, dtype=np.float32) for bound in (mpc.action_low, mpc.action_high))
-            action_space = spaces.Box(low, high, dtype=np.float32)
-        for name, space, size in (
-            ("observation_space", observation_space, mpc.ny),
-            ("action_space", action_space, mpc.nu),
-        ):
-            if not isinstance(space, spaces.Box) or space.shape != (size,):
-                raise InvalidArgumentError(name, expected=f"a Box of shape ({size},), as in the MPC", actual=str(space))
+        observation_space, action_space = spaces_of(mpc, observation_space, action_space)
         made = solver if isinstance(solver, Solver) else None
         if made is None:
             check_solver(cast("str", solver), solver_options)
@@ -300,6 +291,10 @@ class MPCPolicy(BasePolicy):
                 actual=f"False in {self.action_space}",
             )
         return inputs + self.exploration_noise * width * self._noise_generator.standard_normal(inputs.shape)
+
+    def distill(self, starts: Any = None, **options: Any) -> DistilledPolicy:
+        """An explicit policy, a small network that acts as this one: see :func:`mpcoffline.control.distill`."""
+        return distill(self, starts, **options)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the policy to a zip of JSON (no pickle). One that is loaded starts its noise from the same seed.

@@ -56,7 +56,7 @@ def told(exit_code: int, *arguments: str | Path) -> str:
 
 COMMANDS = [
     "run", "reproduce", "collect", "new", "check", "tune", "retune", "serve", "learn", "evaluate", "diagnose", "plot",
-    "export", "clean", "doctor",
+    "distill", "export", "clean", "doctor",
 ]  # fmt: skip
 DATASETS = [f"datasets {name}" for name in ("list", "show", "verify", "replay", "repair", "download", "upload")]
 

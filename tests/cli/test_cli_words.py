@@ -70,7 +70,7 @@ def test_results_have_one_option() -> None:
     }
     assert all(options in ([], ["--out"]) for options in written.values())
     assert {name for name, options in written.items() if options} == {
-        "run", "reproduce", "tune", "learn", "diagnose", "plot", "export",
+        "run", "reproduce", "tune", "learn", "diagnose", "plot", "distill", "export",
     }  # fmt: skip
 
 
