@@ -149,16 +149,26 @@ def innermost(
     score = np.empty(len(rows))
     for i in range(0, len(rows), CHUNK):
         block = rows[i : i + CHUNK]
-        both = split(block, ny, nu)[::3] if states is None else states(block)
-        s, s_next = (part[:, :count] for part in both)
-        # float64: ratios of float32 numbers can overflow.
-        far = (np.abs(part.T.astype(np.float64, order="C") - middle[:, None]) for part in (s, s_next))
-        score[i : i + CHUNK] = (np.maximum(*far) / half[:, None]).max(axis=0)
+        score[i : i + CHUNK] = farness(split(block, ny, nu)[::3] if states is None else states(block), middle, half)
     kept = max(1, round(fraction * len(rows)))
     farthest = np.partition(score, kept - 1)[kept - 1]
     inside = score < farthest
     inside[np.flatnonzero(score == farthest)[: kept - inside.sum()]] = True  # ties by order: the same on each machine
     return np.flatnonzero(inside)
+
+
+def farness(states: tuple[Any, Any], middle: Floats, half: Floats) -> Floats:
+    """How far out each row is, ``(B,)``: max(|s - m| / h, |s+ - m| / h) over the first coordinates.
+
+    Args:
+        states: s and s+ of the rows, ``(B, ny)`` each.
+        middle: m of those coordinates that count, ``(count,)``.
+        half: h, ``(count,)``.
+    """
+    both = (part[:, : len(middle)] for part in states)
+    # float64: ratios of float32 numbers can overflow.
+    far = (np.abs(part.T.astype(np.float64, order="C") - middle[:, None]) for part in both)
+    return np.asarray((np.maximum(*far) / half[:, None]).max(axis=0))
 
 
 def middles(rows: NDArray[np.float32], ny: int) -> tuple[Floats, Floats]:
