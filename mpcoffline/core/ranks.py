@@ -109,7 +109,7 @@ class Ranks:
         from torch import distributed
 
         columns = list(zip(*parts, strict=True))
-        sizes = self.largest([max(float(part.abs().max()) for part in column) for column in columns])
+        sizes = self.largest([float(torch.stack([part.abs().max() for part in column]).max()) for column in columns])
         if not all(map(math.isfinite, sizes)):
             return None
         bits = _DIGITS - 1 - math.ceil(math.log2(max(count, 1)))

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mpcoffline.core.types import Array
-from mpcoffline.datasets.table.shards import Change, Inside
+from mpcoffline.datasets.table.inside import Inside
+from mpcoffline.datasets.table.shards import Change
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,6 +101,22 @@ class Moments:
         difference, n, count = block.mean(axis=along) - self.mean, len(block), self.count
         self.squares += block.var(axis=along) * n + difference**2 * count * n / (count + n)
         self.mean, self.count = self.mean + difference * n / (count + n), count + n
+
+
+def merged_moments(lanes: Sequence[Floats]) -> tuple[Floats, ...]:
+    """Mean, standard deviation, smallest and largest value of each column from those of parts (Chan, Golub, LeVeque).
+
+    Args:
+        lanes: Of each part count, mean, sum of squares about it, smallest and largest value, ``(5, width)``.
+    """
+    count, mean, squares, low, high = lanes[0]
+    for n, other, about, least, most in lanes[1:]:
+        total = np.maximum(count + n, 1.0)
+        difference = other - mean
+        squares = squares + about + difference**2 * count * n / total
+        mean, count = mean + difference * n / total, count + n
+        low, high = np.minimum(low, least), np.maximum(high, most)
+    return mean, np.sqrt(squares / count), low, high
 
 
 def moments(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from mpcoffline.core.scratch import scratch_folder
 from .cache import TableFile, write_table
 from .math import CHUNK
 from .numbers import checked_episode_ids, floats
-from .shards import NAMES
+from .shard_folders import NAMES
 from .transitions import TransitionTable
 
 if TYPE_CHECKING:
@@ -76,10 +76,22 @@ def write_shards(
         if columns != first:
             expected, actual = (f"{ny} observations, {nu} actions, names {names}" for ny, nu, names in (first, columns))
             raise InvalidDataError(f"{table.name}: columns", expected=f"{expected}, as before", actual=actual)
-        for part, start in enumerate(range(0, len(table), rows)):
-            _write(target / f"{number:06d}-{part:04d}", table, slice(start, min(start + rows, len(table))))
+        for part, some in enumerate(_parts(table, rows)):
+            _write(target / f"{number:06d}-{part:04d}", table, some)
     ranks.largest([0.0])  # nobody goes on before all are there
     return sorted(path for path in target.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
+def _parts(table: TransitionTable, rows: int) -> Iterator[slice]:
+    """So many rows of a table at most, one after another; cut between two episodes, where these are not longer."""
+    start, firsts = 0, np.sort(table.episodes.firsts)
+    while start < len(table):
+        stop = min(start + rows, len(table))
+        if stop < len(table):
+            between = int(firsts[np.searchsorted(firsts, stop, side="right") - 1])
+            stop = between if between > start else stop
+        yield slice(start, stop)
+        start = stop
 
 
 def _write(target: Path, table: TransitionTable, part: slice) -> None:
@@ -142,7 +154,7 @@ def read_parquet(
     name = str(path)
     wanted = [*observations, *actions, cost, *(each for each in (episode, terminated) if each is not None)]
     try:
-        frame = polars.read_parquet(path, columns=list(dict.fromkeys(wanted)))
+        frame = polars.read_parquet(str(path), columns=list(dict.fromkeys(wanted)))
     except polars.exceptions.ColumnNotFoundError as error:
         expected, actual = f"columns {', '.join(wanted)}", str(error).splitlines()[0]
         raise InvalidDataError(name, expected=expected, actual=actual) from error

@@ -12,66 +12,32 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.checks import check_integers
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError
+from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.core.ranks import Ranks
 
 from .cache import TableFile
 from .centring import Centring
-from .math import Columns, Moments, TableStatistics, farness, middles, split
+from .math import Columns, Moments, TableStatistics, merged_moments, split
 from .numbers import check_sizes
+from .shard_folders import folders_of, names_of
 from .transitions import TransitionTable
 
 if TYPE_CHECKING:
     import torch
 
-NAMES = "columns.json"
 #: Rows that all processes see, from all over the data.
 EXCERPT_ROWS = 200_000
 POOL_BYTES = 32 << 20  # of a lane's rows that are mixed; the same on every machine, as it decides what is drawn
 _STRETCH = 1_000  # consecutive rows of an excerpt
-_MOST_NAMES = 1 << 20  # bytes
 
 #: From some rows to those that are learned from, perhaps with other columns.
 Change = Callable[[TransitionTable], TransitionTable]
-
-
-class Inside:
-    """Leaves out the rows farther out than those that a table keeps when it is trimmed (:meth:`TransitionTable.trim`).
-
-    Args:
-        middle: What distances are from, ``(count,)``, of the first coordinates.
-        half: Their unit, ``(count,)``.
-        farthest: The largest distance that stays.
-    """
-
-    def __init__(self, middle: NDArray[np.float64], half: NDArray[np.float64], farthest: float) -> None:
-        self._middle, self._half, self._farthest = middle, half, farthest
-
-    @classmethod
-    def of(cls, table: TransitionTable, fraction: float, count: int | None = None) -> Inside:
-        """That of a share of a table's rows.
-
-        Args:
-            table: The table, in memory.
-            fraction: Share of its rows that stay, in (0, 1].
-            count: How many coordinates decide, the first ones; all by default.
-        """
-        middle, half = middles(table.rows, table.ny if count is None else count)
-        far = farness(table.centring.states(table.rows), middle, half)
-        kept = max(1, round(fraction * len(table)))
-        return cls(middle, half, float(np.partition(far, kept - 1)[kept - 1]))
-
-    def __call__(self, table: TransitionTable) -> TransitionTable:
-        """The rows that stay."""
-        far = farness(table.centring.states(table.rows), self._middle, self._half)
-        return table.take(np.flatnonzero(far <= self._farthest))
 
 
 class _Piece(NamedTuple):
@@ -155,8 +121,8 @@ class ShardedTable:
         if lanes < ranks.size:
             hint = "Start fewer processes, or open with more lanes; those are another fit, as another seed is."
             raise InvalidArgumentError("lanes", expected=f"{ranks.size} or more", actual=str(lanes), hint=hint)
-        folders = _folders(shards)
-        files, names = [TableFile(folder) for folder in folders], [_names(folder) for folder in folders]
+        folders = folders_of(shards)
+        files, names = [TableFile(folder) for folder in folders], [names_of(folder) for folder in folders]
         for folder, file, own in zip(folders, files, names, strict=True):
             sizes = {"observations": (file.ny, files[0].ny), "actions": (file.nu, files[0].nu)}
             check_sizes(f"shard {folder}", sizes, f"shard {folders[0]}")
@@ -235,7 +201,7 @@ class ShardedTable:
         if self._statistics is None:
             found = {lane: self._moments(lane) for lane in self.own_lanes}
             every = [self.ranks.shared(found.get(lane), lane % self.ranks.size) for lane in range(self.lanes)]
-            merged = (row[None, :] for row in _merged(every))
+            merged = (row[None, :] for row in merged_moments(every))
             self._statistics = TableStatistics(
                 *(Columns(*(column[0] for column in split(row, self.ny, self.nu))) for row in merged)
             )
@@ -412,42 +378,3 @@ class ShardedTable:
             actual="none",
             hint="Raise trim (now rows far out are left out), use fewer lanes, or look for a shard of another plant.",
         )
-
-
-def _merged(lanes: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
-    """Mean, standard deviation, smallest and largest value from those of lanes (Chan, Golub, LeVeque)."""
-    count, mean, squares, low, high = lanes[0]
-    for n, other, about, least, most in lanes[1:]:
-        total = np.maximum(count + n, 1.0)
-        difference = other - mean
-        squares = squares + about + difference**2 * count * n / total
-        mean, count = mean + difference * n / total, count + n
-        low, high = np.minimum(low, least), np.maximum(high, most)
-    return mean, np.sqrt(squares / count), low, high
-
-
-def _folders(shards: str | PathLike[str] | Sequence[str | PathLike[str]]) -> list[Path]:
-    """The folders of the shards."""
-    if not isinstance(shards, str | PathLike):
-        folders = [Path(each) for each in shards]
-    elif not Path(shards).is_dir():
-        raise InvalidArgumentError("shards", expected="a folder with shards", actual=f"{shards}, which is none")
-    else:
-        folders = sorted(path for path in Path(shards).iterdir() if path.is_dir() and not path.name.startswith("."))
-    if not folders:
-        hint = "mpcoffline.datasets.write_shards writes them."
-        raise InvalidArgumentError("shards", expected="at least one", actual=f"none in {shards}", hint=hint)
-    return folders
-
-
-def _names(folder: Path) -> tuple[str, ...]:
-    """Names and units of a shard's columns."""
-    try:
-        path = folder / NAMES
-        if not path.exists():
-            return ()
-        if path.stat().st_size > _MOST_NAMES:
-            raise ValueError("too long")
-        return tuple(str(name) for name in json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise FileFormatError(f"shard {folder}", expected=f"names in {NAMES}", actual=str(error)) from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -145,7 +145,7 @@ class LearnValue(Stage):
         if known.value_function is not None:
             return None
         seen = known if known.limits is None else known.with_rows(known.limits.added)
-        how = {"seed": known.seed, "device": known.device, "shards": seen.shards}
+        how: dict[str, Any] = {"seed": known.seed, "device": known.device, "shards": seen.shards}
         return ValueTraining(seen.table, known.mpc.discount, self._config, **how)
 
     def outcome(self, known: Known, training: Training) -> Known:
@@ -171,7 +171,7 @@ class LearnParameters(Stage):
         value, config, seen = known.constant_value, self._adapting(known), known
         if known.cost is None and ends_matter(known.table, mpc.discount):  # of which T knows; no cost explains them
             seen = known.with_rows(going_on)
-        how = {"seed": known.seed, "cost": known.cost, "limits": known.limits, "shards": seen.shards}
+        how: dict[str, Any] = {"seed": known.seed, "cost": known.cost, "limits": known.limits, "shards": seen.shards}
         return ParameterTraining(mpc, value, seen.table, known.groups, config, **how)
 
     def _adapting(self, known: Known) -> ParameterConfig:
