@@ -45,13 +45,13 @@ def test_two_processes_of_which_one_is_killed_learn_what_one_learns(folder: Path
     path = os.pathsep.join([str(ROOT), str(program.parent)])
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3_000:]
-    assert "Signal 9" in done.stderr or "exitcode  : -9" in done.stderr or "-9" in done.stderr
+    assert "-9" in done.stderr  # as torchrun says it
     first, second = (np.load(tmp_path / f"two-{rank}.npy") for rank in (0, 1))
     assert np.array_equal(first, second)
     assert np.array_equal(first, alone.theta)
     assert not np.array_equal(first, lq_plant.make_mpc().theta)
 
+    other = ShardedTable.open(folder, lanes=sharded_fit.LANES + 1)
+    learner = OfflineMPCLearner(lq_plant.make_mpc(), "cost+model", "paper", seed=0)
     with pytest.raises(InvalidArgumentError, match="checkpoint: expected a checkpoint of the same data"):
-        other = ShardedTable.open(folder, lanes=sharded_fit.LANES + 1)
-        learner = OfflineMPCLearner(lq_plant.make_mpc(), "cost+model", "paper", seed=0)
         learner.fit(other, checkpoint=tmp_path / "two.ckpt", show_progress=False)
