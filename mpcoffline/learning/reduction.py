@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -13,21 +13,25 @@ from mpcoffline.core.ranks import Ranks
 from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 
+Some = TypeVar("Some")
 #: The parts of a minibatch that this process has: of each its share of the rows, and the rows.
 Parts = Sequence[tuple[float, Columns]]
-#: A mean over rows of which the gradient is wanted, and one that is shown.
-Loss = Callable[[Columns], tuple[Tensor, Tensor]]
 
 
 class Reduction:
     """Of minibatches that are whole: a mean is that of the rows, a gradient what autograd gives."""
 
-    def gradient(self, loss: Loss, parts: Parts, tensors: Sequence[Tensor]) -> float:
+    def gradient(
+        self,
+        loss: Callable[[Some], tuple[Tensor, Tensor]],
+        parts: Sequence[tuple[float, Some]],
+        tensors: Sequence[Tensor],
+    ) -> float:
         """Leaves the gradient of a mean over a minibatch in ``tensor.grad``.
 
         Args:
-            loss: The mean over some rows.
-            parts: The minibatch.
+            loss: From some rows to the mean over them of which the gradient is wanted, and one that is shown.
+            parts: The minibatch: of each part its share, and its rows.
             tensors: What it is a function of.
 
         Returns:
@@ -38,8 +42,8 @@ class Reduction:
         value.backward()  # type: ignore[no-untyped-call]
         return float(shown.detach())
 
-    def mean(self, values: Callable[[Columns], Tensor], parts: Parts) -> Tensor | None:
-        """The mean over a minibatch of a value of each row; None where every part is whole, and knows it."""
+    def mean(self, values: Callable[[Some], Tensor], parts: Sequence[tuple[float, Some]]) -> Tensor | None:
+        """The mean over a minibatch of a value of each row; None where a minibatch is whole, and its loss knows it."""
         return None
 
 
@@ -58,7 +62,12 @@ class ByLanes(Reduction):
     def __init__(self, ranks: Ranks, lanes: int) -> None:
         self._ranks, self._lanes = ranks, lanes
 
-    def gradient(self, loss: Loss, parts: Parts, tensors: Sequence[Tensor]) -> float:
+    def gradient(
+        self,
+        loss: Callable[[Some], tuple[Tensor, Tensor]],
+        parts: Sequence[tuple[float, Some]],
+        tensors: Sequence[Tensor],
+    ) -> float:
         """See :class:`Reduction`; NaN, and so are the gradients, where one of a part is not finite."""
         found: list[list[Tensor]] = []
         for share, rows in parts:
@@ -73,7 +82,7 @@ class ByLanes(Reduction):
             tensor.grad = torch.full_like(tensor, torch.nan) if sums is None else sums[i].to(tensor.dtype)
         return torch.nan if sums is None else float(sums[-1])
 
-    def mean(self, values: Callable[[Columns], Tensor], parts: Parts) -> Tensor | None:
+    def mean(self, values: Callable[[Some], Tensor], parts: Sequence[tuple[float, Some]]) -> Tensor | None:
         """See :class:`Reduction`."""
         with torch.no_grad():
             own = [[share * values(rows).mean().reshape(1)] for share, rows in parts]

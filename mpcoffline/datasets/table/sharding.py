@@ -26,7 +26,7 @@ from .transitions import TransitionTable
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-SHARD_ROWS = 1 << 24
+SHARD_ROWS = 1 << 26  # some gigabytes: a process may have about a thousand files open, and has three of each shard
 
 
 def write_shards(

@@ -8,17 +8,19 @@ lanes decide the result, not who works on them.
 from __future__ import annotations
 
 import copy
+import errno
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.checks import check_integers
-from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError, StorageError
 from mpcoffline.core.ranks import Ranks
 
 from .cache import TableFile
@@ -114,6 +116,7 @@ class ShardedTable:
             InvalidArgumentError: For no shard at all, or fewer lanes than processes.
             InvalidDataError: For shards with other columns than the first one, or fewer rows than lanes.
             FileFormatError: For a damaged shard.
+            StorageError: For more shards than a process may have files open.
             MPCOfflineError: If not all processes come.
         """
         check_integers(1, lanes=lanes)
@@ -122,7 +125,7 @@ class ShardedTable:
             hint = "Start fewer processes, or open with more lanes; those are another fit, as another seed is."
             raise InvalidArgumentError("lanes", expected=f"{ranks.size} or more", actual=str(lanes), hint=hint)
         folders = folders_of(shards)
-        files, names = [TableFile(folder) for folder in folders], [names_of(folder) for folder in folders]
+        files, names = [_opened(folder, len(folders)) for folder in folders], [names_of(folder) for folder in folders]
         for folder, file, own in zip(folders, files, names, strict=True):
             sizes = {"observations": (file.ny, files[0].ny), "actions": (file.nu, files[0].nu)}
             check_sizes(f"shard {folder}", sizes, f"shard {folders[0]}")
@@ -378,3 +381,14 @@ class ShardedTable:
             actual="none",
             hint="Raise trim (now rows far out are left out), use fewer lanes, or look for a shard of another plant.",
         )
+
+
+def _opened(folder: Path, count: int) -> TableFile:
+    """A shard, one of so many."""
+    try:
+        return TableFile(folder)
+    except FileFormatError as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.EMFILE, errno.ENFILE):
+            expected, hint = f"to open {count} shards", "Raise the limit (ulimit -n), or write larger shards."
+            raise StorageError("shards", expected=expected, actual="too many open files", hint=hint) from error
+        raise

@@ -17,7 +17,7 @@ from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.learning.adam import STATE, Adam
 from mpcoffline.learning.limit_costs import LimitCosts
-from mpcoffline.learning.reduction import Source
+from mpcoffline.learning.reduction import Parts, Source
 from mpcoffline.learning.stages import FitResult, KnownCost, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
@@ -90,8 +90,8 @@ class ParameterTraining:
         cost: How the logged costs follow from the MPC's, where that is known: then the stage cost stays.
         limits: What soft limits cost, which the table does not contain; their parameters are learned where ``groups``
             have ``"constraints"``.
-        shards: Where the table is an excerpt, all transitions: minibatches are of these. The convex fit is of the
-            table.
+        shards: Where the table is an excerpt, all transitions: minibatches, and the rows of the convex fit, are of
+            these.
 
     Raises:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
@@ -134,6 +134,7 @@ class ParameterTraining:
         self._low, self._high = (torch.from_numpy(b) for b in (self._coordinates.low, self._coordinates.high))
         source = Source.of(table, shards, config.batch_size, self._rng, seed)
         self._data, self._batches, self._reduction = source
+        self._shards = shards
         self._n_gradients = config.n_steps if "model" in groups else 0
         self.n_steps = self._n_gradients + 1
         self.attempt = self.step = 0
@@ -251,11 +252,20 @@ class ParameterTraining:
             prior=config.prior,
             shaped=config.potential,
             max_iterations=config.refit_iterations,
+            parts=self._fitted_parts(),
+            reduction=self._reduction,
         )
         at_bounds = tuple(self._coordinates.at_bounds(refit.theta))
         if at_bounds:
             _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", listed(at_bounds))
         return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
+
+    def _fitted_parts(self) -> Parts | None:
+        """The rows of the convex fit that this process has of shards; None where all of them are the sample."""
+        if self._shards is None:
+            return None
+        drawn = next(self._shards.batches(min(self.config.refit_rows, len(self._shards)), self._seed))
+        return [(share, self._data.columns(rows)) for share, rows in drawn]
 
     def _with_limits(self, found: FitResult) -> FitResult:
         """The result with the parameters of limits, where these are learned."""
