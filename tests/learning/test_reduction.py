@@ -101,3 +101,16 @@ def test_trainings_from_shards_go_on_bit_for_bit(shards: ShardedTable) -> None:
 def test_no_episodes_are_held_out_of_shards(shards: ShardedTable) -> None:
     with pytest.raises(InvalidArgumentError, match="validation: expected 0 where rows come from shards"):
         ValueTraining(shards.excerpt(), 0.9, ValueConfig(validation=0.1), seed=0, shards=shards)
+
+
+def test_the_convex_fit_in_parts_is_that_of_the_whole(shards: ShardedTable) -> None:
+    """With all rows in the sample and in the parts, both are the same convex problem."""
+    mpc, value, groups = lq_plant.make_mpc(), lq_plant.QuadraticValue(lq_plant.BEST.P), ("cost",)
+    config, table = ParameterConfig(refit_rows=len(shards), prior=1e-6), lq_episodes.episodes(n=300)
+    of_table, of_shards = (
+        ParameterTraining(mpc, value, table, groups, config, seed=0, shards=each) for each in (None, shards)
+    )
+    for training in (of_table, of_shards):
+        training.advance(1)
+    assert of_shards.result.loss_after == pytest.approx(of_table.result.loss_after, rel=1e-4, abs=1e-9)
+    np.testing.assert_allclose(of_shards.result.theta, of_table.result.theta, rtol=1e-3, atol=1e-4)

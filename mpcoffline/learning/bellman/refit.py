@@ -77,10 +77,8 @@ def refit_cost(
     start = Coordinates(mpc.with_theta(theta), ("cost",), scaling)
     reduction = reduction or Reduction()
     potential = Potential(sample.observations) if shaped else None
-    prepared = [
-        (share, _Prepared.of(problem, potential, rows, theta))
-        for share, rows in ([(1.0, sample)] if parts is None else parts)
-    ]
+    whole: Parts = [(1.0, sample)]
+    prepared = [(share, _Prepared.of(problem, potential, rows, theta)) for share, rows in parts or whole]
     offset = torch.from_numpy(nominal.z(theta))
     ratio = torch.from_numpy(start.scale / nominal.scale)
 

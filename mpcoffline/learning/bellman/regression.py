@@ -164,6 +164,8 @@ class ParameterTraining:
         """Makes n more gradient steps, fewer at the end of an attempt, and alone the last step; returns the error."""
         if self.step >= self._n_gradients:
             self.step = min(self.step + n, self.n_steps)
+            if self._shards is not None:
+                self._result = None  # what a process may have looked at before is of the sample
             return {"fit_loss": self.result.loss_after}
         losses: list[float] = []
         made, self._result = min(n, self._n_gradients - self.step), None
@@ -253,7 +255,7 @@ class ParameterTraining:
             shaped=config.potential,
             max_iterations=config.refit_iterations,
             parts=self._fitted_parts(),
-            reduction=self._reduction,
+            reduction=self._reduction if self.done else None,
         )
         at_bounds = tuple(self._coordinates.at_bounds(refit.theta))
         if at_bounds:
@@ -261,8 +263,11 @@ class ParameterTraining:
         return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
 
     def _fitted_parts(self) -> Parts | None:
-        """The rows of the convex fit that this process has of shards; None where all of them are the sample."""
-        if self._shards is None:
+        """The rows of the convex fit that this process has of shards; None where these are the sample.
+
+        Before the end that is so, too: a process may look at the result without the others.
+        """
+        if self._shards is None or not self.done:
             return None
         drawn = next(self._shards.batches(min(self.config.refit_rows, len(self._shards)), self._seed))
         return [(share, self._data.columns(rows)) for share, rows in drawn]
