@@ -134,7 +134,7 @@ def read_parquet(
     out. For logs as historians write them (times, units, gaps) use :meth:`mpcoffline.Plant.read` instead.
 
     Args:
-        path: The file. With ``fsspec`` installed, polars also takes addresses as ``s3://...``.
+        path: The file, or an address that ``polars.read_parquet`` takes.
         observations: Columns of s.
         actions: Columns of a.
         cost: Column of L(s, a).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from pathlib import Path
 
 import lq_episodes
@@ -13,6 +14,8 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, Invali
 from mpcoffline.core.ranks import Ranks
 from mpcoffline.datasets import ShardedTable, TransitionTable, read_parquet, write_shards
 from mpcoffline.datasets.table.inside import Inside
+from mpcoffline.datasets.table.memory import remembering, with_memory
+from mpcoffline.mpc.layout import Layout
 
 
 @pytest.fixture(scope="module")
@@ -170,3 +173,14 @@ def test_parquet_files_become_transitions(tmp_path: Path) -> None:
     assert table.episode_ids.tolist() == [7, 7, 9]
     with pytest.raises(InvalidDataError, match="expected columns x, v"):
         read_parquet(tmp_path / "a.parquet", **(how | {"actions": ["v"]}))
+
+
+def test_past_inputs_come_from_the_rows_before(folder: Path, whole: TransitionTable) -> None:
+    layout = Layout.of(2, 1, 3)
+    truth = {row.tobytes() for row in with_memory(whole, layout).rows}
+    shards = ShardedTable.open(folder, lanes=3).mapped(partial(remembering, layout=layout))
+    assert (shards.ny, shards.nu) == (5, 1)
+    pieces = [shards._rows(shards._piece(lane, i)) for lane in range(3) for i in range(shards._n_pieces(lane))]
+    found = np.concatenate([piece.rows for piece in pieces if piece is not None])
+    assert {row.tobytes() for row in found} <= truth
+    assert len(found) >= len(truth) - 3 * len(pieces)  # the first rows of a block have no past there
