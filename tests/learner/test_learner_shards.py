@@ -40,7 +40,7 @@ def test_another_plant_is_refused_before_anything_is_learned(folder: Path) -> No
 def test_two_processes_of_which_one_is_killed_learn_what_one_learns(folder: Path, tmp_path: Path) -> None:
     alone, _ = sharded_fit.fitted(folder, tmp_path / "alone.ckpt")
     program = Path(sharded_fit.__file__)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "--max-restarts=1"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "--max-restarts=3"]
     command += [str(program), str(folder), str(tmp_path / "two.ckpt"), str(tmp_path / "two"), "--dies", "1", "6"]
     path = os.pathsep.join([str(ROOT), str(program.parent)])
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False)
