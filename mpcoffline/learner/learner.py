@@ -20,6 +20,7 @@ from mpcoffline.core.notebook import html_of
 from mpcoffline.core.progress import Bars
 from mpcoffline.core.text import check_name
 from mpcoffline.core.threads import one_blas_thread
+from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import OutputIdentification, Sensors
 from mpcoffline.estimation.consistency import check
@@ -37,6 +38,7 @@ from .findings import findings
 from .presets import method_of
 from .run import Run
 from .softening import Soften, Softening, check_soften, softening_found
+from .together import Together, opened
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -192,7 +194,7 @@ class OfflineMPCLearner:
 
     def fit(
         self,
-        dataset: MinariDataset | TransitionTable | OutputIdentification | str,
+        dataset: MinariDataset | TransitionTable | ShardedTable | OutputIdentification | str,
         *,
         n_steps: int | None = None,
         n_steps_per_epoch: int | None = None,
@@ -208,7 +210,8 @@ class OfflineMPCLearner:
         First :func:`mpcoffline.check` compares the MPC with the data, and what it finds likely is logged as a warning.
 
         Args:
-            dataset: A Minari data set, the id of one, a table of transitions, or what
+            dataset: A Minari data set, the id of one, a table of transitions, shards of what is larger than a machine
+                (:class:`~mpcoffline.datasets.ShardedTable`, by one process or several), or what
                 :func:`~mpcoffline.estimation.identify_from_outputs` found in a log that holds outputs in place of
                 states: then candidates are tried behind an observer, and ``output_policy`` takes outputs.
             n_steps: Gradient steps of (VALUE), by far the longest part; the method's by default.
@@ -253,7 +256,7 @@ class OfflineMPCLearner:
 
     def fitter(
         self,
-        dataset: MinariDataset | TransitionTable | OutputIdentification | str,
+        dataset: MinariDataset | TransitionTable | ShardedTable | OutputIdentification | str,
         *,
         n_steps: int | None = None,
         n_steps_per_epoch: int | None = None,
@@ -278,13 +281,16 @@ class OfflineMPCLearner:
         self.sensors = None
         if isinstance(dataset, OutputIdentification):
             self.sensors, start, dataset = dataset.sensors, start or dataset.mpc, dataset.table
-        table, observation_space = self._table(dataset)
+        table, observation_space, shards = opened(dataset, self.seed)
+        together = Together(shards)
+        if not together.is_first:
+            callbacks, evaluators, show_progress = (), {}, False
         report = check(self.nominal_mpc, table)
         report.raise_for_errors()
         for finding in report.warnings:
             logger.warning("%s", finding)
         known = Known(self.nominal_mpc, table, _GROUPS[self.learn], self.seed, self.device, self._given_value_function)
-        self.start, known = start, replace(known, start=start)
+        self.start, known = start, replace(known, start=start, shards=shards)
         self.softening = Softening.of(self.nominal_mpc, table, self.seed) if self.soften else None
         run = Run(method, known)
         saved = None if checkpoint is None else Checkpoint(checkpoint, run.identity)
@@ -301,20 +307,21 @@ class OfflineMPCLearner:
                     metrics |= {name: float(evaluator(self, table)) for name, evaluator in (evaluators or {}).items()}
                 history.append((len(history) + 1, metrics))
                 self.history = history
-                if saved is not None and run.result is None:  # what comes last takes seconds and can be repeated
-                    saved.write(run, history)
+                if saved is not None and run.result is None and together.is_first:
+                    saved.write(run, history)  # what comes last takes seconds and can be repeated
                 answers = [callback(self, len(history), epoch.total_step) for callback in callbacks]
                 shown = ", ".join(f"{name} {value:.4g}" for name, value in epoch.metrics.items())
                 bars.show(epoch.phase, epoch.step, epoch.n_steps, shown)
                 yield history[-1]
-                if any(asks_to_end(answer) for answer in answers):
+                if together.any_asks(any(asks_to_end(answer) for answer in answers)):
                     break
-            if run.learned is not None:
+            if run.learned is not None and together.is_first:
                 bars.busy("models of the log")
                 kept = None if saved is None else saved.kept
                 self.candidates = candidates_of(self, run, table, bars, also or {}, kept, core_seconds() - begun)
                 self._policy = None
-            self._mpc = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
+            found = self._found() if self.candidates is None else self.candidates.mpc  # which lets go of the data
+            self._mpc = together.handed_out(found)
             if self.sensors is not None and self._mpc is not None:
                 self.sensors = self.sensors.suited(self._mpc, table)
 
@@ -368,16 +375,6 @@ class OfflineMPCLearner:
             hint = "Call fit(identify_from_outputs(mpc, log, outputs, ...))."
             raise MPCOfflineError("learner", expected="a fit of outputs", actual="states, or no fit", hint=hint)
         return OutputFeedbackPolicy(self.policy, self.sensors.observer(self.policy.mpc))
-
-    def _table(self, dataset: MinariDataset | TransitionTable | str) -> tuple[TransitionTable, spaces.Box | None]:
-        if isinstance(dataset, TransitionTable):
-            return dataset, None
-        if isinstance(dataset, str):
-            from mpcoffline.datasets import load_dataset
-
-            dataset = load_dataset(dataset)
-        table, space = TransitionTable.of(dataset), dataset.observation_space
-        return table, space if isinstance(space, spaces.Box) else None
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes nominal and learned MPC, value function, method and history to a zip of JSON and npz.

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.text import listed
-from mpcoffline.datasets.table.memory import with_memory
+from mpcoffline.datasets.table.memory import remembering, with_memory
+from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.estimation.beginnings import beginnings
 from mpcoffline.learning import FitResult, Known, Method, Stage, Training, ValueFunction
-from mpcoffline.learning.ends import innermost
+from mpcoffline.learning.ends import innermost, inside
 from mpcoffline.learning.stages import Arrays, Change
 from mpcoffline.mpc import MPC
 
@@ -60,7 +61,9 @@ class Run:
 
     def __init__(self, method: Method, start: Known) -> None:
         mpc = start.mpc
-        start.table.check_fits(mpc.ny, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
+        for data in (start.table, start.shards):
+            if data is not None:
+                data.check_fits(mpc.ny, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))
         _check_device(start.device)
         self.method, self._start = method, start
         self._mpc = method.restructured(mpc.replace(model=mpc.model.suited_to_log(start.table)))
@@ -100,6 +103,7 @@ class Run:
             changes = [later for _, later in stages if not isinstance(later, Stage)]
             while not training.done:
                 metrics = training.advance(n_steps or stage.epoch)
+                _check_alike(known.shards, stage.phase, training)
                 if len(changes) == len(stages):  # the last stage with steps; what is found once holds until the next
                     self._outcome = functools.cache(functools.partial(_ended, known, stage, training, changes))
                     if _is_done(training):
@@ -116,10 +120,14 @@ class Run:
     def _prepared(self) -> Known:
         """What the stages begin with: past inputs beside the observations where the MPC holds some, then trimmed."""
         known = self.method.prepared(replace(self._start, mpc=self._mpc, given=self._start.mpc))
-        table = with_memory(known.table, known.mpc.layout)
-        n = known.mpc.layout.n_states
-        begun = beginnings(known.table, known.mpc.layout, known.seed)
-        return replace(known, table=innermost(table, self.method.trim, known.mpc.discount, n), begun=begun)
+        layout, discount = known.mpc.layout, known.mpc.discount
+        table, shards = with_memory(known.table, layout), known.shards
+        begun, how = beginnings(known.table, layout, known.seed), (self.method.trim, discount, layout.n_states)
+        if shards is not None and layout.n_memory:
+            shards = shards.mapped(functools.partial(remembering, layout=layout))
+        if shards is not None and (trimmed := inside(table, *how)) is not None:
+            shards = shards.mapped(trimmed)
+        return replace(known, table=innermost(table, *how), begun=begun, shards=shards)
 
     @property
     def learned(self) -> Callable[[], MPC] | None:
@@ -148,6 +156,8 @@ class Run:
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
         for column in (start.table.rows, start.table.episode_ids, *start.table.centring):
             digest.update(np.ascontiguousarray(column).data)
+        if start.shards is not None:
+            digest.update(start.shards.identity)
         if start.start is not None:
             digest.update(json.dumps(start.start.to_json(), sort_keys=True).encode())
         if start.value_function is not None:
@@ -168,6 +178,13 @@ class Run:
         for key, array in arrays.items():
             name, _, own = key.partition("/")
             self._restored.setdefault(name, {})[own] = array
+
+
+def _check_alike(shards: ShardedTable | None, phase: str, training: Training) -> None:
+    """Refuses to go on where the processes of a job have learned different things."""
+    if shards is not None and shards.ranks.size > 1:
+        state = b"".join(np.ascontiguousarray(array).tobytes() for _, array in sorted(training.to_arrays().items()))
+        shards.ranks.check_alike(f"state of {phase}", state)
 
 
 def _is_done(training: Training) -> bool:

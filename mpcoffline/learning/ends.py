@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.inside import Inside
+from mpcoffline.datasets.table.shards import Change
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 
@@ -58,6 +60,22 @@ def innermost(table: TransitionTable, fraction: float, discount: float, count: i
         _log.info("Episodes end at a price: no rows are left out, as ends lie far out")
         return table
     return table.trim(fraction, count)
+
+
+def inside(table: TransitionTable, fraction: float, discount: float, count: int | None = None) -> Change | None:
+    """What :func:`innermost` does, for the rows of which a table is an excerpt: it decides how far out is too far.
+
+    Returns:
+        From rows to those that stay; None where all do.
+    """
+    if fraction >= 1.0 or ends_matter(table, discount):
+        return None
+    return Inside.of(table, fraction, count)
+
+
+def going_on(table: TransitionTable) -> TransitionTable:
+    """The transitions after which an episode goes on."""
+    return table.take(np.flatnonzero(np.asarray(table.terminations) == 0.0))
 
 
 def priced_ends(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> Ends | None:

@@ -63,7 +63,7 @@ def with_limit_costs(known: Known) -> Known:
     if found is None:
         return known
     _log.info("Soft limits: %s", found)
-    return replace(known, table=found.without(known.table), limits=found)
+    return replace(known.with_rows(found.without), limits=found)
 
 
 def _ratio(logged: Array, ours: Array) -> float:

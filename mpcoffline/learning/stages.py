@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
+from mpcoffline.datasets.table.shards import Change as RowChange, ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation import Identification
 from mpcoffline.mpc import MPC
@@ -164,6 +165,7 @@ class Known:
         found: What identification found; None where the model was not identified.
         start: An MPC that was learned before, where searches begin, too; None without.
         begun: The first transitions of episodes as they were logged; None where no past inputs are in the state.
+        shards: All transitions, where the table is an excerpt of them: what minibatches are drawn from.
     """
 
     mpc: MPC
@@ -181,6 +183,16 @@ class Known:
     found: Identification | None = None
     start: MPC | None = None
     begun: TransitionTable | None = None
+    shards: ShardedTable | None = None
+
+    def with_rows(self, change: RowChange) -> Known:
+        """The same with something done to the transitions, in memory and in shards.
+
+        Args:
+            change: From some consecutive rows to what is learned of them.
+        """
+        shards = None if self.shards is None else self.shards.mapped(change)
+        return replace(self, table=change(self.table), shards=shards)
 
     @property
     def constant_value(self) -> ValueFunction:

@@ -123,6 +123,12 @@ class TableFile:
         return self.raw_ids
 
     @property
+    def identity(self) -> list[Any]:
+        """What tells it from other tables: sizes, centring and checksums, as JSON."""
+        sizes = [self.ny, self.nu, len(self), self.block_rows, self._ids_crc]
+        return [*sizes, self.centring.to_json(), *self._crcs]
+
+    @property
     def n_blocks(self) -> int:
         """Number of blocks, the last of which may be shorter."""
         return len(self._crcs)

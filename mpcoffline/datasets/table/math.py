@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,6 +103,22 @@ class Moments:
         self.mean, self.count = self.mean + difference * n / (count + n), count + n
 
 
+def merged_moments(lanes: Sequence[Floats]) -> tuple[Floats, ...]:
+    """Mean, standard deviation, smallest and largest value of each column from those of parts (Chan, Golub, LeVeque).
+
+    Args:
+        lanes: Of each part count, mean, sum of squares about it, smallest and largest value, ``(5, width)``.
+    """
+    count, mean, squares, low, high = lanes[0]
+    for n, other, about, least, most in lanes[1:]:
+        total = np.maximum(count + n, 1.0)
+        difference = other - mean
+        squares = squares + about + difference**2 * count * n / total
+        mean, count = mean + difference * n / total, count + n
+        low, high = np.minimum(low, least), np.maximum(high, most)
+    return mean, np.sqrt(squares / count), low, high
+
+
 def moments(
     rows: NDArray[np.float32], values: Callable[[NDArray[np.float32]], Floats]
 ) -> tuple[Floats, Floats, Floats, Floats]:
@@ -149,16 +165,26 @@ def innermost(
     score = np.empty(len(rows))
     for i in range(0, len(rows), CHUNK):
         block = rows[i : i + CHUNK]
-        both = split(block, ny, nu)[::3] if states is None else states(block)
-        s, s_next = (part[:, :count] for part in both)
-        # float64: ratios of float32 numbers can overflow.
-        far = (np.abs(part.T.astype(np.float64, order="C") - middle[:, None]) for part in (s, s_next))
-        score[i : i + CHUNK] = (np.maximum(*far) / half[:, None]).max(axis=0)
+        score[i : i + CHUNK] = farness(split(block, ny, nu)[::3] if states is None else states(block), middle, half)
     kept = max(1, round(fraction * len(rows)))
     farthest = np.partition(score, kept - 1)[kept - 1]
     inside = score < farthest
     inside[np.flatnonzero(score == farthest)[: kept - inside.sum()]] = True  # ties by order: the same on each machine
     return np.flatnonzero(inside)
+
+
+def farness(states: tuple[Any, Any], middle: Floats, half: Floats) -> Floats:
+    """How far out each row is, ``(B,)``: max(|s - m| / h, |s+ - m| / h) over the first coordinates.
+
+    Args:
+        states: s and s+ of the rows, ``(B, ny)`` each.
+        middle: m of those coordinates that count, ``(count,)``.
+        half: h, ``(count,)``.
+    """
+    both = (part[:, : len(middle)] for part in states)
+    # float64: ratios of float32 numbers can overflow.
+    far = (np.abs(part.T.astype(np.float64, order="C") - middle[:, None]) for part in both)
+    return np.asarray((np.maximum(*far) / half[:, None]).max(axis=0))
 
 
 def middles(rows: NDArray[np.float32], ny: int) -> tuple[Floats, Floats]:

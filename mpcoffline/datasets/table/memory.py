@@ -84,6 +84,14 @@ def with_memory(table: TransitionTable, layout: Layout, usual: Array | None = No
     return table.rewritten(blocks(), centring=Centring(np.concatenate(joined), increments), sizes=(layout.nx, nu))
 
 
+def remembering(table: TransitionTable, layout: Layout) -> TransitionTable:
+    """:func:`with_memory` of some consecutive rows: empty where no past inputs are known of any of them."""
+    try:
+        return with_memory(table, layout)
+    except InvalidDataError:
+        return table.take(slice(0, 0))
+
+
 def gathered(table: TransitionTable, states: Indices, inputs: Indices | None = None) -> TransitionTable:
     """A table of some of the columns.
 

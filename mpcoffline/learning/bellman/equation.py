@@ -78,14 +78,26 @@ class BellmanProblem:
         cost: Tensor = self._stage(s.double(), batch.actions.double(), theta)
         return self._scale * cost.squeeze(-1)
 
-    def error(self, batch: Columns, theta: Tensor) -> Tensor:
-        """The mean squared error over a minibatch, a scalar."""
+    def residuals(self, batch: Columns, theta: Tensor) -> Tensor:
+        """What (FIT) leaves of each row, ``(B,)``, without the constant c."""
         explained = self.predicted_value(batch, theta) + self.stage_cost(batch, theta)
-        return self.mean_square(self.target(batch) - explained)
+        return self.target(batch) - explained
 
-    def mean_square(self, residuals: Tensor) -> Tensor:
-        """The variance of residuals in units of the cost's: their mean square with the best constant."""
-        return ((residuals - residuals.mean()) / self.unit).square().mean()
+    def error(self, batch: Columns, theta: Tensor, constant: Tensor | None = None) -> Tensor:
+        """The mean squared error over a minibatch, a scalar.
+
+        Args:
+            batch: The minibatch, or a part of it.
+            theta: The parameters.
+            constant: c; the best for these rows by default. That of a whole minibatch makes the mean of its parts'
+                gradients the gradient of the whole: in the best constant the derivative vanishes.
+        """
+        return self.mean_square(self.residuals(batch, theta), constant)
+
+    def mean_square(self, residuals: Tensor, constant: Tensor | None = None) -> Tensor:
+        """The variance of residuals in units of the cost's: their mean square with the best constant, or one given."""
+        best = residuals.mean() if constant is None else constant
+        return ((residuals - best) / self.unit).square().mean()
 
 
 class PredictionError:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +16,7 @@ from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.learning.potential import Potential
+from mpcoffline.learning.reduction import Parts, Reduction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
 from mpcoffline.mpc.scaling import Scaling
@@ -47,6 +50,8 @@ def refit_cost(
     prior: float,
     shaped: bool,
     max_iterations: int,
+    parts: Parts | None = None,
+    reduction: Reduction | None = None,
 ) -> Refit:
     """The cost parameters, and the potential, that minimise (FIT) for a fixed model, by L-BFGS-B.
 
@@ -62,32 +67,39 @@ def refit_cost(
         prior: Weight of the squared distance to the MPC's parameters in scaled coordinates.
         shaped: Whether the stage cost has a potential besides.
         max_iterations: Bound on the iterations.
+        parts: The transitions that are fitted, where the sample is not all of them: the parts of this process.
+        reduction: How means over these are taken.
 
     Raises:
         MPCOfflineError: If the fit is lost.
     """
     nominal = Coordinates(mpc, ("cost",), scaling)
     start = Coordinates(mpc.with_theta(theta), ("cost",), scaling)
-    with torch.no_grad():
-        target = problem.target(sample) - problem.predicted_value(sample, torch.from_numpy(theta))
-        potential = Potential(sample.observations) if shaped else None
-        shaping = problem.unit * _shaping(potential, problem, sample, theta)
+    reduction = reduction or Reduction()
+    potential = Potential(sample.observations) if shaped else None
+    whole: Parts = [(1.0, sample)]
+    prepared = [(share, _Prepared.of(problem, potential, rows, theta)) for share, rows in parts or whole]
     offset = torch.from_numpy(nominal.z(theta))
     ratio = torch.from_numpy(start.scale / nominal.scale)
 
-    def residuals(z: Tensor) -> Tensor:
-        explained = problem.stage_cost(sample, start.theta(z[: start.size])) + shaping @ z[start.size :]
-        return target - explained
+    def residuals(z: Tensor, rows: _Prepared) -> Tensor:
+        explained = problem.stage_cost(rows.columns, start.theta(z[: start.size])) + rows.shaping @ z[start.size :]
+        return rows.target - explained
 
     def objective(point: Array) -> tuple[float, Array]:
         z = torch.from_numpy(point).requires_grad_()
-        distance = (offset + ratio * z[: start.size]).square().sum() + z[start.size :].square().sum()
-        loss = problem.mean_square(residuals(z)) + prior * distance
-        loss.backward()  # type: ignore[no-untyped-call]
-        gradient = z.grad
-        return float(loss.detach()), np.zeros_like(point) if gradient is None else gradient.numpy()
+        constant = reduction.mean(partial(residuals, z.detach()), prepared)
 
-    n_shaping = shaping.shape[1]
+        def loss(rows: _Prepared) -> tuple[Tensor, Tensor]:
+            distance = (offset + ratio * z[: start.size]).square().sum() + z[start.size :].square().sum()
+            found = problem.mean_square(residuals(z, rows), constant) + prior * distance
+            return found, found
+
+        shown = reduction.gradient(loss, prepared, [z])
+        gradient = z.grad
+        return shown, np.zeros_like(point) if gradient is None else gradient.numpy()
+
+    n_shaping = 0 if potential is None else prepared[0][1].shaping.shape[1]
     found = scipy.optimize.minimize(
         objective,
         np.concatenate([start.start, np.zeros(n_shaping)]),
@@ -106,9 +118,45 @@ def refit_cost(
     fitted = canonical(mpc, start.theta(z[: start.size]).numpy())
     if potential is not None:
         potential.coefficients = problem.unit * z[start.size :]
+    level, error = _left(problem, prepared, reduction, torch.from_numpy(fitted), z[start.size :])
+    return Refit(with_level(mpc, fitted, level), error, potential)
+
+
+class _Prepared(NamedTuple):
+    """Transitions with what does not depend on the cost: what it has to explain, and what the potential multiplies."""
+
+    columns: Columns
+    target: Tensor
+    shaping: Tensor
+
+    @classmethod
+    def of(cls, problem: BellmanProblem, potential: Potential | None, rows: Columns, theta: Array) -> _Prepared:
+        """That of some rows, for the model of theta."""
+        with torch.no_grad():
+            target = problem.target(rows) - problem.predicted_value(rows, torch.from_numpy(theta))
+            return cls(rows, target, problem.unit * _shaping(potential, problem, rows, theta))
+
+
+def _left(
+    problem: BellmanProblem,
+    prepared: Sequence[tuple[float, _Prepared]],
+    reduction: Reduction,
+    theta: Tensor,
+    coefficients: Tensor,
+) -> tuple[float, float]:
+    """The mean of what a cost leaves unexplained, and its variance in units of the cost's."""
+
+    def missed(rows: _Prepared) -> Tensor:
+        return rows.target - problem.stage_cost(rows.columns, theta) - rows.shaping @ coefficients
+
     with torch.no_grad():
-        missed = target - problem.stage_cost(sample, torch.from_numpy(fitted)) - shaping @ z[start.size :]
-    return Refit(with_level(mpc, fitted, float(missed.mean())), float(problem.mean_square(missed)), potential)
+        constant = reduction.mean(missed, prepared)
+        if constant is None:
+            ((_, rows),) = prepared
+            found = missed(rows)
+            return float(found.mean()), float(problem.mean_square(found))
+        error = reduction.mean(lambda rows: ((missed(rows) - constant) / problem.unit).square(), prepared)
+    return float(constant), float(torch.nan if error is None else error)
 
 
 def _shaping(potential: Potential | None, problem: BellmanProblem, sample: Columns, theta: Array) -> Tensor:

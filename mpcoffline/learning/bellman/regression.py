@@ -13,9 +13,11 @@ from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.text import listed
 from mpcoffline.core.types import Array
-from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.datasets.table.shards import ShardedTable
+from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.learning.adam import STATE, Adam
 from mpcoffline.learning.limit_costs import LimitCosts
+from mpcoffline.learning.reduction import Parts, Source
 from mpcoffline.learning.stages import FitResult, KnownCost, Metrics
 from mpcoffline.learning.value.fit import ValueFunction, cosine
 from mpcoffline.learning.value.network import same_shape, whole_numbers
@@ -88,6 +90,8 @@ class ParameterTraining:
         cost: How the logged costs follow from the MPC's, where that is known: then the stage cost stays.
         limits: What soft limits cost, which the table does not contain; their parameters are learned where ``groups``
             have ``"constraints"``.
+        shards: Where the table is an excerpt, all transitions: minibatches, and the rows of the convex fit, are of
+            these.
 
     Raises:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
@@ -104,9 +108,10 @@ class ParameterTraining:
         seed: int,
         cost: KnownCost | None = None,
         limits: LimitCosts | None = None,
+        shards: ShardedTable | None = None,
     ) -> None:
         self._groups = groups = groups if cost is None else tuple(group for group in groups if group != "cost")
-        self._mpc, self._table, self.config, self._seed = mpc, table, config, seed
+        self._mpc, self.config, self._seed = mpc, config, seed
         self._limits = limits if "constraints" in groups else None
         costs = table.costs
         self._rng = np.random.default_rng(seed)
@@ -127,7 +132,9 @@ class ParameterTraining:
                 hint="Evaluate mpc.dynamics_function and mpc.stage_function at the logged states and actions.",
             )
         self._low, self._high = (torch.from_numpy(b) for b in (self._coordinates.low, self._coordinates.high))
-        self._batches = table.batches(config.batch_size, self._rng)
+        source = Source.of(table, shards, config.batch_size, self._rng, seed)
+        self._data, self._batches, self._reduction = source
+        self._shards = shards
         self._n_gradients = config.n_steps if "model" in groups else 0
         self.n_steps = self._n_gradients + 1
         self.attempt = self.step = 0
@@ -157,6 +164,8 @@ class ParameterTraining:
         """Makes n more gradient steps, fewer at the end of an attempt, and alone the last step; returns the error."""
         if self.step >= self._n_gradients:
             self.step = min(self.step + n, self.n_steps)
+            if self._shards is not None:
+                self._result = None  # what a process may have looked at before is of the sample
             return {"fit_loss": self.result.loss_after}
         losses: list[float] = []
         made, self._result = min(n, self._n_gradients - self.step), None
@@ -180,20 +189,30 @@ class ParameterTraining:
         config = self.config
         schedule = cosine(self.step, self._n_gradients) * 0.5**self.attempt
         self._optimiser.learning_rate = config.learning_rate * schedule
-        batch, theta = self._table.columns(next(self._batches)), self._coordinates.theta(self._z)
-        error = self._problem.error(batch, theta)
-        loss = error + config.prior * self._z.square().sum()
-        if config.prediction_weight > 0.0:
-            loss = loss + config.prediction_weight * self._prediction_error(batch, theta)
+        parts = [(share, self._data.columns(rows)) for share, rows in next(self._batches)]
+
+        def residuals(batch: Columns) -> torch.Tensor:
+            return self._problem.residuals(batch, self._coordinates.theta(self._z.detach()))
+
+        constant = self._reduction.mean(residuals, parts)
+
+        def loss(batch: Columns) -> tuple[torch.Tensor, torch.Tensor]:
+            theta = self._coordinates.theta(self._z)
+            error = self._problem.error(batch, theta, constant)
+            found = error + config.prior * self._z.square().sum()
+            if config.prediction_weight > 0.0:
+                found = found + config.prediction_weight * self._prediction_error(batch, theta)
+            return found, error
+
         self._optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        error = self._reduction.gradient(loss, parts, [self._z])
         norm = torch.nn.utils.clip_grad_norm_([self._z], config.clip)
         if not torch.isfinite(norm):  # one NaN would stay in Adam's moments for ever
             return []
         self._optimiser.step()
         with torch.no_grad():
             self._z.clamp_(self._low, self._high)
-        return [float(error.detach())]
+        return [error]
 
     def _failed(self) -> bool:
         """Whether the gradient steps ended with a larger objective than they began with."""
@@ -235,11 +254,23 @@ class ParameterTraining:
             prior=config.prior,
             shaped=config.potential,
             max_iterations=config.refit_iterations,
+            parts=self._fitted_parts(),
+            reduction=self._reduction if self.done else None,
         )
         at_bounds = tuple(self._coordinates.at_bounds(refit.theta))
         if at_bounds:
             _log.warning("(FIT) ended on the bounds of %s: are the bounds right?", listed(at_bounds))
         return FitResult(refit.theta, self._loss_before, refit.error, at_bounds, refit.potential)
+
+    def _fitted_parts(self) -> Parts | None:
+        """The rows of the convex fit that this process has of shards; None where these are the sample.
+
+        Before the end that is so, too: a process may look at the result without the others.
+        """
+        if self._shards is None or not self.done:
+            return None
+        drawn = next(self._shards.batches(min(self.config.refit_rows, len(self._shards)), self._seed))
+        return [(share, self._data.columns(rows)) for share, rows in drawn]
 
     def _with_limits(self, found: FitResult) -> FitResult:
         """The result with the parameters of limits, where these are learned."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from mpcoffline.estimation import fit_residual, with_residual
 from mpcoffline.estimation.beginnings import applied_before
 from mpcoffline.estimation.delays import find_delays
 from mpcoffline.estimation.plant import settled
-from mpcoffline.learning.ends import ends_matter, priced_ends
+from mpcoffline.learning.ends import ends_matter, going_on, priced_ends
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.learning.linear_quadratic import riccati_cost
 from mpcoffline.learning.potential import Potential
@@ -89,6 +89,10 @@ def identified(known: Known, config: StartConfig) -> Known:
     tried = ["dead times"] if config.delays and known.value_function is None else []
     rows = as_logged(known.mpc, known.table, known.cost)
     found, table = identify_as_logged(known.mpc, known.table, rows, tried=tried, seed=known.seed, start=known.start)
+    if known.shards is not None and not found.noise.negligible and found.noise.source != "unknown":
+        text = "The log has measurement noise, which is taken out of an excerpt: V and theta are learned of its %d rows"
+        _log.warning(text, len(table))
+        known = replace(known, shards=None)
     known = replace(known, table=table, found=found, mpc=_begun_as_logged(known, found.model))
     if "model" not in known.groups:
         return known
@@ -140,8 +144,9 @@ class LearnValue(Stage):
         """See :class:`~mpcoffline.learning.value.training.ValueTraining`."""
         if known.value_function is not None:
             return None
-        table = known.table if known.limits is None else known.limits.added(known.table)
-        return ValueTraining(table, known.mpc.discount, self._config, seed=known.seed, device=known.device)
+        seen = known if known.limits is None else known.with_rows(known.limits.added)
+        how: dict[str, Any] = {"seed": known.seed, "device": known.device, "shards": seen.shards}
+        return ValueTraining(seen.table, known.mpc.discount, self._config, **how)
 
     def outcome(self, known: Known, training: Training) -> Known:
         """Adds V_phi."""
@@ -163,12 +168,11 @@ class LearnParameters(Stage):
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
         self.phase = f"(FIT) learning {'+'.join(known.groups)}"
         mpc = known.mpc if known.cost is not None else in_units_of(known.mpc, known.table)
-        value, config, table = known.constant_value, self._adapting(known), known.table
-        if known.cost is None and ends_matter(table, mpc.discount):  # of which T knows; no stage cost explains them
-            table = table.take(np.flatnonzero(np.asarray(table.terminations) == 0.0))
-        return ParameterTraining(
-            mpc, value, table, known.groups, config, seed=known.seed, cost=known.cost, limits=known.limits
-        )
+        value, config, seen = known.constant_value, self._adapting(known), known
+        if known.cost is None and ends_matter(known.table, mpc.discount):  # of which T knows; no cost explains them
+            seen = known.with_rows(going_on)
+        how: dict[str, Any] = {"seed": known.seed, "cost": known.cost, "limits": known.limits, "shards": seen.shards}
+        return ParameterTraining(mpc, value, seen.table, known.groups, config, **how)
 
     def _adapting(self, known: Known) -> ParameterConfig:
         """The configuration, without steps on a model that was identified and predicts well, or has the right cost."""

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
 from mpcoffline.datasets.table.math import split
+from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import TransitionTable
 
 #: Variation below this share of a column's largest magnitude is rounding of float32 numbers.
@@ -61,7 +62,7 @@ class ValueFunction(nn.Module):
         """The networks, ``n_members`` of them."""
         return list(self.net.members) if isinstance(self.net, Mean) else [self.net]  # type: ignore[list-item, arg-type]
 
-    def normalise(self, table: TransitionTable, discount: float) -> None:
+    def normalise(self, table: TransitionTable | ShardedTable, discount: float) -> None:
         """Sets the normalisation from data: V lies around mean(L) / (1 - gamma), and varies as L / (1 - gamma) does.
 
         Where episodes terminate, gamma is multiplied by the share of transitions that go on.

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mpcoffline.datasets.table.transitions import Columns
 from mpcoffline.learning.adam import STATE, Adam
+from mpcoffline.learning.reduction import Parts, Reduction
 
 from .methods import ValueMethod
 
@@ -138,26 +139,31 @@ class Member:
         nets: V's initial network, and Q's where the method learns one.
         bounds: Between which the target is held.
         device: Torch device.
+        reduction: How a gradient over a minibatch is taken.
     """
 
-    def __init__(self, nets: Sequence[nn.Sequential], bounds: tuple[float, float], device: str) -> None:
+    def __init__(
+        self, nets: Sequence[nn.Sequential], bounds: tuple[float, float], device: str, reduction: Reduction
+    ) -> None:
         networks = [FlatNetwork.like(net) for net in nets]
         start = [network.weights_of(net).to(device) for network, net in zip(networks, nets, strict=True)]
         self.critic = FlatCritic(networks, [weights.clone().requires_grad_() for weights in start])
         self.target = FlatCritic(networks, start, bounds)
-        self._optimiser = Adam(self.critic.weights, fused=True)
+        self._optimiser, self._reduction = Adam(self.critic.weights, fused=True), reduction
 
-    def descend(
-        self, method: ValueMethod, batch: Columns, discount: float, learning_rate: float, polyak: float
-    ) -> float:
+    def descend(self, method: ValueMethod, parts: Parts, discount: float, learning_rate: float, polyak: float) -> float:
         """One step of Adam, after which the target follows; nothing changes where the gradient is not finite.
 
         Returns:
             The loss; NaN where no step was made.
         """
+
+        def loss(batch: Columns) -> tuple[Tensor, Tensor]:
+            found = method.loss(self.critic, self.target, batch, discount)
+            return found, found
+
         self._optimiser.zero_grad()
-        loss = method.loss(self.critic, self.target, batch, discount)
-        loss.backward()  # type: ignore[no-untyped-call]
+        shown = self._reduction.gradient(loss, parts, self.critic.weights)
         steepness = sum(float(weights.grad.norm()) for weights in self.critic.weights if weights.grad is not None)
         if not math.isfinite(steepness):  # one NaN would stay in Adam's moments for ever
             return math.nan
@@ -166,7 +172,7 @@ class Member:
         with torch.no_grad():
             for following, weights in zip(self.target.weights, self.critic.weights, strict=True):
                 following.lerp_(weights, polyak)
-        return float(loss.detach())
+        return shown
 
     def loss(self, method: ValueMethod, batch: Columns, discount: float) -> float:
         """The loss of what is learned so far, with V in place of its target."""

@@ -12,8 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mpcoffline.core.errors import FileFormatError, MPCOfflineError
+from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
+from mpcoffline.learning.reduction import Source
 
 from .config import SWEEPS, ValueConfig, cosine
 from .function import ValueFunction, tanh_network
@@ -48,6 +50,10 @@ class ValueTraining:
         seed: Seeds weights, minibatches and the choice of the validation episodes; the same seed gives the same
             weights on the same machine.
         device: Torch device.
+        shards: Where the table is an excerpt, all transitions: minibatches, units and bounds are of these.
+
+    Raises:
+        InvalidArgumentError: For a share of validation beside shards.
 
     Attributes:
         step: Steps made.
@@ -57,8 +63,18 @@ class ValueTraining:
     """
 
     def __init__(
-        self, table: TransitionTable, discount: float, config: ValueConfig, *, seed: int, device: str = "cpu"
+        self,
+        table: TransitionTable,
+        discount: float,
+        config: ValueConfig,
+        *,
+        seed: int,
+        device: str = "cpu",
+        shards: ShardedTable | None = None,
     ) -> None:
+        if shards is not None and config.validation:
+            expected = "0 where rows come from shards: no episodes are held out of these"
+            raise InvalidArgumentError("validation", expected=expected, actual=f"{config.validation:g}")
         self.step, self.n_steps = 0, config.n_steps
         self._config, self._discount, self._device = config, discount, device
         self.stochasticity = estimate_stochasticity(table, seed=seed) if config.method == "auto" else None
@@ -71,10 +87,11 @@ class ValueTraining:
             nets = [[net] for net in self._value.members]
             if self.method.learns_q:
                 nets = [[net, tanh_network(table.ny + table.nu, config.hidden)] for [net] in nets]
-        self._value.normalise(table, discount)
-        self._units = Units(table, self._value, discount, device)
-        self._members = [Member(pair, self._units.bounds, device) for pair in nets]
-        self._batches = table.batches(config.batch_size, np.random.default_rng(seed))
+        source = Source.of(table, shards, config.batch_size, np.random.default_rng(seed), seed)
+        self._value.normalise(source.data, discount)
+        self._units = Units(source.data, self._value, discount, device)
+        self._members = [Member(pair, self._units.bounds, device, source.reduction) for pair in nets]
+        self._batches = source.batches
         self._validation = None if held_out is None else self._batch(next(held_out.batches(_VALIDATION_ROWS, seed)))
         self._validation_loss, self._best_loss = math.nan, math.inf
         self._best_step, self._best = 0, self._weights()
@@ -161,10 +178,10 @@ class ValueTraining:
 
     def _gradient_step(self) -> list[float]:
         """One step of each member; returns the losses that were finite."""
-        config, batch = self._config, self._batch(next(self._batches))
+        config, parts = self._config, [(share, self._batch(rows)) for share, rows in next(self._batches)]
         learning_rate = config.learning_rate * cosine(self.step, self.n_steps)
         polyak = config.rate(self._discount)
-        losses = [member.descend(self.method, batch, self._discount, learning_rate, polyak) for member in self._members]
+        losses = [member.descend(self.method, parts, self._discount, learning_rate, polyak) for member in self._members]
         finite = [loss for loss in losses if math.isfinite(loss)]
         self._skipped = 0 if len(finite) == len(losses) else self._skipped + 1
         if self._skipped == 1:

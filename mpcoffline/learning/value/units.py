@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from mpcoffline.datasets.table.math import split
+from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TableStatistics, TransitionTable
 
 from .function import ValueFunction
@@ -32,7 +33,9 @@ class Units:
         device: Torch device.
     """
 
-    def __init__(self, table: TransitionTable, value: ValueFunction, discount: float, device: str = "cpu") -> None:
+    def __init__(
+        self, table: TransitionTable | ShardedTable, value: ValueFunction, discount: float, device: str = "cpu"
+    ) -> None:
         statistics = table.statistics()
         std = torch.from_numpy(statistics.std.actions)
         action_mean, action_std = torch.from_numpy(statistics.mean.actions), torch.where(std > 0.0, std, 1.0)

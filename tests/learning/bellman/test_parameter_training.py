@@ -30,10 +30,10 @@ def training(mpc: MPC | None = None, groups: tuple[str, ...] = BOTH, **options: 
 def test_going_on_after_a_skipped_step_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     honest, calls = BellmanProblem.error, 0
 
-    def faulty(self: BellmanProblem, batch: Any, theta: torch.Tensor) -> torch.Tensor:
+    def faulty(self: BellmanProblem, batch: Any, theta: torch.Tensor, constant: Any = None) -> torch.Tensor:
         nonlocal calls
         calls += theta.requires_grad
-        return honest(self, batch, theta) * (torch.nan if theta.requires_grad and calls == 5 else 1.0)
+        return honest(self, batch, theta, constant) * (torch.nan if theta.requires_grad and calls == 5 else 1.0)
 
     monkeypatch.setattr(BellmanProblem, "error", faulty)
     whole = training()

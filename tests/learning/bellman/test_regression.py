@@ -439,10 +439,10 @@ def test_a_gradient_that_is_not_finite_is_skipped(monkeypatch: pytest.MonkeyPatc
     calls = 0
     honest = BellmanProblem.error
 
-    def faulty(self: BellmanProblem, batch: Any, theta: torch.Tensor) -> torch.Tensor:
+    def faulty(self: BellmanProblem, batch: Any, theta: torch.Tensor, constant: Any = None) -> torch.Tensor:
         nonlocal calls
         calls += 1
-        return honest(self, batch, theta) * (torch.nan if calls % 3 == 0 else 1.0)
+        return honest(self, batch, theta, constant) * (torch.nan if calls % 3 == 0 else 1.0)
 
     monkeypatch.setattr(BellmanProblem, "error", faulty)
     training = ParameterTraining(
