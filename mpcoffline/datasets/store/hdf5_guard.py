@@ -298,6 +298,8 @@ class _Walk:
             if kind.detect_class(h5py.h5t.VLEN):
                 raise self._refused(where, "numbers or texts", str(array.dtype))
             return
+        if array.ndim == 0:
+            return  # one text is no larger than its file
         if array.ndim != 1:
             raise self._refused(where, "one text a row", f"shape {array.shape}")
         first, left = 0, self._bytes_left
