@@ -152,10 +152,10 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         self.action_space = float32_box([c.low for c in plant.inputs], [c.high for c in plant.inputs])
         self.observation_space = float32_box(-bound, bound)
         self.state_space = float64_box(self.start_bound())
-        self.start = self._checked_start("start", self.starts[0] if start is None else start)
-        self.process_noise = checked_deviations("process_noise", process_noise, nx)
-        self.measurement_noise = checked_deviations("measurement_noise", measurement_noise, nx)
-        self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
+        self.start: str | tuple[Array, Array] = self._checked_start("start", self.starts[0] if start is None else start)
+        self.process_noise: Array = checked_deviations("process_noise", process_noise, nx)
+        self.measurement_noise: Array = checked_deviations("measurement_noise", measurement_noise, nx)
+        self.render_mode: str | None = checked_render_mode(render_mode, self.metadata["render_modes"])
         self._viewer = None if render_mode is None else self.new_viewer(render_mode)
 
     def _set_parameters(self, given: dict[str, Any]) -> None:

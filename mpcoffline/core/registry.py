@@ -28,6 +28,8 @@ class Registry(Generic[T]):
         methods: Methods that each must have, beside the abstract ones of ``base``; ``"a|b"`` asks for one of them.
     """
 
+    kind: str
+
     def __init__(self, kind: str, base: type[Any] = object, methods: tuple[str, ...] = ()) -> None:
         self.kind, self._base, self._methods = kind, base, methods
         self._things: dict[str, T] = {}

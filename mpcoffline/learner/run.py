@@ -58,6 +58,8 @@ class Run:
         result: What was found, once all is done.
     """
 
+    method: Method
+
     def __init__(self, method: Method, start: Known) -> None:
         mpc = start.mpc
         start.table.check_fits(mpc.ny, mpc.nu, np.asarray(mpc.action_low), np.asarray(mpc.action_high))

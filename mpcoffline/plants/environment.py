@@ -70,7 +70,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if plant not in _DESCRIBED:
             hint = "Run what describes it first, as mpcoffline.plants.load_plant(file).env()."
             raise UnknownIdError.of("plant of an environment", plant, _DESCRIBED, hint)
-        self.plant = _DESCRIBED[plant]
+        self.plant: Plant = _DESCRIBED[plant]
         check_number("noise", noise, 0.0, open_low=False)
         check_number("spread", spread, 0.0, open_low=False)
         self._courses = dict(signals or {})
@@ -92,7 +92,9 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         low, high = (np.append(own, [pair[i] for pair in outside]) for i, own in enumerate(shown))
         self._shown = low.astype(np.float32), high.astype(np.float32)
         self.observation_space = spaces.Box(*self._shown, dtype=np.float32)
-        self.action_space = spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32), dtype=np.float32)
+        self.action_space = spaces.Box(
+            self._low.astype(np.float32), self._high.astype(np.float32), dtype=np.float32
+        )
         self._rate = np.array([np.inf if each.rate is None else each.rate for each in self.plant.inputs])
         self._x: Array | None = None
 

@@ -93,6 +93,10 @@ class ParameterTraining:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
     """
 
+    config: ParameterConfig
+    attempt: int
+    step: int
+
     def __init__(
         self,
         mpc: MPC,
@@ -129,7 +133,7 @@ class ParameterTraining:
         self._low, self._high = (torch.from_numpy(b) for b in (self._coordinates.low, self._coordinates.high))
         self._batches = table.batches(config.batch_size, self._rng)
         self._n_gradients = config.n_steps if "model" in groups else 0
-        self.n_steps = self._n_gradients + 1
+        self.n_steps: int = self._n_gradients + 1
         self.attempt = self.step = 0
         self._begin()
 

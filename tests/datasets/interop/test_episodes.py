@@ -84,7 +84,7 @@ S, A, L = trajectories((3,), (False,))[0][:3]
         ((S, A, L[:2]), r"episode 0: costs: expected shape \(3,\), got \(2,\)"),
         ((np.zeros((4, 8, 8, 3), np.uint8), A, L), r"uint8 of shape \(4, 8, 8, 3\), images\?"),
         ((np.zeros((4, 84, 1), np.uint8), A, L), r"uint8 of shape \(4, 84, 1\), images\?"),
-        ((np.where(S == S[2, 1], np.nan, S), A, L), "episode 0, step 1: next observation 1: .* got nan"),
+        ((np.where(np.equal(S, S[2, 1]), np.nan, S), A, L), "episode 0, step 1: next observation 1: .* got nan"),
         ((S, A, L + np.inf), "episode 0, step 0: cost"),
         ((S, A, L > 0.0), "costs: expected an array of numbers, got an array of bool"),
         ((S, np.array(["a", "b", "c"]), L), "actions: expected an array of numbers"),

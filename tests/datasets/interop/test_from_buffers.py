@@ -54,7 +54,9 @@ def test_an_episode_may_be_unfinished_and_two_may_touch() -> None:
     assert_same(from_dict(data), [first, second])
     data["timeouts"] = data["timeouts"] & (np.arange(6) < 5)
     assert_same(from_dict(data), [first, second])
-    assert_same(from_dict({k: v for k, v in data.items() if k != "next_observations"}), [first, second], without_last=True)
+    assert_same(
+        from_dict({k: v for k, v in data.items() if k != "next_observations"}), [first, second], without_last=True
+    )
 
 
 def test_safety_costs_are_no_stage_costs() -> None:
@@ -193,7 +195,9 @@ def test_files_of_d3rlpy_that_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(FileFormatError, match=r"text\.h5"):
         from_d3rlpy(tmp_path / "text.h5")
-    with pytest.raises(InvalidArgumentError, match="expected a ReplayBuffer of d3rlpy, its episodes, or a file, got int"):
+    with pytest.raises(
+        InvalidArgumentError, match="expected a ReplayBuffer of d3rlpy, its episodes, or a file, got int"
+    ):
         from_d3rlpy(3)
 
 
@@ -266,7 +270,7 @@ def test_tensors_that_are_refused() -> None:
     with pytest.raises(InvalidArgumentError, match=r"the entry \('next', 'terminated'\)"):
         from_torchrl(batch.exclude(("next", "terminated")))
     batch["action"] = torch.nn.functional.one_hot(torch.arange(11))
-    with pytest.raises(InvalidDataError, match="action: expected a continuous action: .* got int64"):
+    with pytest.raises(InvalidDataError, match=r"action: expected a continuous action: .* got int64"):
         from_torchrl(batch)
     for other in ({"observation": 1}, 3, [1, 2]):
         with pytest.raises(InvalidArgumentError, match="data: expected a TensorDict or a buffer of it"):

@@ -151,7 +151,7 @@ def test_steps_that_are_refused() -> None:
     given = [{"steps": steps(trajectories()[0])}]
     with pytest.raises(InvalidArgumentError, match="the keys that make up the observation, got none of state, image"):
         from_rlds(given)
-    with pytest.raises(InvalidDataError, match="image: expected one vector a step, .* images"):
+    with pytest.raises(InvalidDataError, match=r"image: expected one vector a step, .* images"):
         from_rlds(given, observations=["state", "image"])
     with pytest.raises(InvalidArgumentError, match="RLDS, episode 0: expected steps with"):
         from_rlds(given, observations=["state", "speed"])
@@ -207,5 +207,5 @@ def test_data_of_do_mpc_that_are_refused() -> None:
     with pytest.raises(InvalidArgumentError, match="data: expected stored data of do-mpc with '_u', got str"):
         from_do_mpc("results.pkl", cost="L")
     stored._u[2] = np.nan
-    with pytest.raises(InvalidDataError, match="action 0: .* got nan"):
+    with pytest.raises(InvalidDataError, match=r"action 0: .* got nan"):
         from_do_mpc(stored, cost="L")
