@@ -113,6 +113,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     angle: ClassVar[int | None]
     picture_size: ClassVar[tuple[int, int]] = (600, 600)
     trail_steps: ClassVar[int] = 30
+    __signature__: ClassVar[inspect.Signature]
 
     action_space: spaces.Box
     observation_space: spaces.Box
@@ -133,7 +134,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         if cls.__init__ is ControlTask.__init__:
             kind = inspect.Parameter.KEYWORD_ONLY
             own = [inspect.Parameter(p.name, kind, default=p.value) for p in plant.parameters]
-        cls.__signature__ = inspect.Signature([*own, *common])  # type: ignore[attr-defined]
+        cls.__signature__ = inspect.Signature([*own, *common])
 
     def __init__(
         self,

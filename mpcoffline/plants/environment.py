@@ -92,9 +92,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         low, high = (np.append(own, [pair[i] for pair in outside]) for i, own in enumerate(shown))
         self._shown = low.astype(np.float32), high.astype(np.float32)
         self.observation_space = spaces.Box(*self._shown, dtype=np.float32)
-        self.action_space = spaces.Box(
-            self._low.astype(np.float32), self._high.astype(np.float32), dtype=np.float32
-        )
+        self.action_space = spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32), dtype=np.float32)
         self._rate = np.array([np.inf if each.rate is None else each.rate for each in self.plant.inputs])
         self._x: Array | None = None
 

@@ -20,10 +20,11 @@ class Shown:
         names: Names and units of the columns, observations first; none where nobody said.
     """
 
-    ny: int
-    nu: int
-    name: str
-    names: tuple[str, ...]
+    def __init__(self, ny: int, nu: int, name: str, names: tuple[str, ...]) -> None:
+        self.ny: int = ny
+        self.nu: int = nu
+        self.name: str = name
+        self.names: tuple[str, ...] = names
 
     def _repr_html_(self) -> str:
         return html_of_rows(self)

@@ -66,10 +66,11 @@ class TransitionTable(Shown):
         memory: int | None = None,
         names: tuple[str, ...] = (),
     ) -> None:
-        self._rows, self.ny, self.nu, self._episode_ids, self.name = rows, ny, nu, episode_ids, name
+        super().__init__(ny, nu, name, names)
+        self._rows, self._episode_ids = rows, episode_ids
         self.centring: Centring = Centring.none(ny, nu) if centring is None else centring
         self._plain = self.centring.is_none
-        self._file, self._memory, self.names = file, memory, names
+        self._file, self._memory = file, memory
 
     @property
     def rows(self) -> NDArray[np.float32]:
