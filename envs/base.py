@@ -113,6 +113,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
     angle: ClassVar[int | None]
     picture_size: ClassVar[tuple[int, int]] = (600, 600)
     trail_steps: ClassVar[int] = 30
+    __signature__: ClassVar[inspect.Signature]
 
     action_space: spaces.Box
     observation_space: spaces.Box
@@ -133,7 +134,7 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         if cls.__init__ is ControlTask.__init__:
             kind = inspect.Parameter.KEYWORD_ONLY
             own = [inspect.Parameter(p.name, kind, default=p.value) for p in plant.parameters]
-        cls.__signature__ = inspect.Signature([*own, *common])  # type: ignore[attr-defined]
+        cls.__signature__ = inspect.Signature([*own, *common])
 
     def __init__(
         self,
@@ -152,10 +153,10 @@ class ControlTask(gym.Env[NDArray[Any], NDArray[Any]]):
         self.action_space = float32_box([c.low for c in plant.inputs], [c.high for c in plant.inputs])
         self.observation_space = float32_box(-bound, bound)
         self.state_space = float64_box(self.start_bound())
-        self.start = self._checked_start("start", self.starts[0] if start is None else start)
-        self.process_noise = checked_deviations("process_noise", process_noise, nx)
-        self.measurement_noise = checked_deviations("measurement_noise", measurement_noise, nx)
-        self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
+        self.start: str | tuple[Array, Array] = self._checked_start("start", self.starts[0] if start is None else start)
+        self.process_noise: Array = checked_deviations("process_noise", process_noise, nx)
+        self.measurement_noise: Array = checked_deviations("measurement_noise", measurement_noise, nx)
+        self.render_mode: str | None = checked_render_mode(render_mode, self.metadata["render_modes"])
         self._viewer = None if render_mode is None else self.new_viewer(render_mode)
 
     def _set_parameters(self, given: dict[str, Any]) -> None:

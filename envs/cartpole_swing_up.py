@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -118,7 +120,7 @@ class CartPoleSwingUpEnv(ControlTask):
     """
 
     plant = PLANT
-    picture_size = (600, 400)
+    picture_size: ClassVar[tuple[int, int]] = (600, 400)
     l: float  # noqa: E741 -- the plant's own name
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:

@@ -131,7 +131,7 @@ class LinearTrackingEnv(ControlTask):
     def __init__(
         self, alpha: float = 1.0, *, A: ArrayLike | None = None, B: ArrayLike | None = None, **arguments: Any
     ) -> None:
-        self.alpha = checked_number("alpha", alpha, 0.0, MAX_ALPHA)
+        self.alpha: float = checked_number("alpha", alpha, 0.0, MAX_ALPHA)
         matrices = plant_matrices(self.alpha)
         A, B = (own if given is None else given for own, given in zip(matrices, (A, B), strict=True))
         super().__init__(A=A, B=B, **arguments)

@@ -148,6 +148,9 @@ class Canvas:
         gymnasium.error.DependencyNotInstalled: Without pygame.
     """
 
+    width: int
+    height: int
+
     def __init__(self, size: tuple[int, int]) -> None:
         self._pygame, self._gfx = load_pygame()
         self._pygame.font.init()

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -50,6 +51,8 @@ class ControlTaskVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[
         ValueError: For an argument out of its range.
     """
 
+    num_envs: int
+
     metadata: dict[str, Any] = {  # noqa: RUF012 -- declared so by gymnasium
         "render_modes": ["rgb_array"],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -67,18 +70,18 @@ class ControlTaskVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs: expected a positive integer, got {num_envs}.")
-        self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
-        self.task = self.task_class(**task_kwargs)
+        self.render_mode: str | None = checked_render_mode(render_mode, self.metadata["render_modes"])
+        self.task: ControlTask = self.task_class(**task_kwargs)
         self.num_envs, nx = num_envs, self.task.state_space.shape[0]
-        self.max_episode_steps = np.inf if max_episode_steps in (None, -1) else max_episode_steps
+        self.max_episode_steps: float | int = np.inf if max_episode_steps in (None, -1) else max_episode_steps
         self.metadata = self.metadata | {
             "render_fps": self.task.metadata["render_fps"],
             "autoreset_mode": _checked_autoreset_mode(autoreset_mode),
         }
-        self.single_observation_space = self.task.observation_space
-        self.single_action_space = self.task.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.single_observation_space: spaces.Box = self.task.observation_space
+        self.single_action_space: spaces.Box = self.task.action_space
+        self.observation_space: spaces.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: spaces.Space[Any] = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
         self._noise = _NormalRows(num_envs, nx) if self.task.noisy else None
         self._starts: list[dict[str, Any]] = [{}] * num_envs

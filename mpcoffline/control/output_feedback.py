@@ -57,6 +57,9 @@ class OutputFeedbackPolicy(BasePolicy):
         InvalidArgumentError: For an observer of another MPC, or a space of another size.
     """
 
+    policy: MPCPolicy
+    observer: KalmanObserver
+
     def __init__(
         self, policy: MPCPolicy, observer: KalmanObserver, *, observation_space: spaces.Box | None = None
     ) -> None:

@@ -115,13 +115,13 @@ class MPCPolicy(BasePolicy):
                 actual=f"{made!r}{' of another MPC' * (made.mpc is not mpc)}, options {list(solver_options)}",
             )
         super().__init__(observation_space, action_space)
-        self.mpc, self._made = mpc, made
-        self.solver_name = solver if isinstance(solver, str) else solver.name
-        self.solver_options = solver_options if made is None else changed_options(made)
+        self.mpc: MPC = mpc
+        self.solver_name: str = solver if isinstance(solver, str) else solver.name
+        self.solver_options: dict[str, Any] = solver_options if made is None else changed_options(made)
         self._fallback = Fallback(mpc, rescue, rescue_time)
         self.exploration_noise = exploration_noise
         self.set_random_seed(seed)
-        self._solver = made
+        self._solver = self._made = made
         self._vec_normalize: VecNormalize | None = None
         self._clipping_reported = False
 

@@ -31,6 +31,9 @@ class D3rlpyPredictor:
         reward_scaler: None.
     """
 
+    gamma: float
+    action_size: int
+
     observation_scaler = action_scaler = reward_scaler = None
 
     def __init__(self, policy: MPCPolicy) -> None:

@@ -183,7 +183,8 @@ def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
             if dtype.kind not in "biuf" or min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
                 raise ValueError(f"{name}: {len(data)} bytes for shape {shape} of {dtype}")
             array = np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
-            found[name.removesuffix(".npy")] = array
+            # In this machine's order of bytes: torch and CasADi take no other.
+            found[name.removesuffix(".npy")] = array.astype(dtype.newbyteorder("="), copy=False)
     return found
 
 

@@ -31,6 +31,11 @@ class MPCOfflineError(Exception):
         hint: What to do next.
     """
 
+    name: str
+    expected: str
+    actual: str
+    hint: str
+
     def __init__(self, name: str, *, expected: str, actual: str, hint: str = "") -> None:
         self.name, self.expected, self.actual, self.hint = name, expected, actual, hint
         message = f"{name}: expected {expected}, got {actual}."

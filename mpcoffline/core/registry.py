@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, ItemsView, Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from .checks import check_known
 from .errors import FileFormatError, InvalidArgumentError
 
 T = TypeVar("T")
+K = TypeVar("K")  # what a decorator stands before stays what it is
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]{0,63}")
 
 
@@ -28,17 +29,24 @@ class Registry(Generic[T]):
         methods: Methods that each must have, beside the abstract ones of ``base``; ``"a|b"`` asks for one of them.
     """
 
+    kind: str
+
     def __init__(self, kind: str, base: type[Any] = object, methods: tuple[str, ...] = ()) -> None:
         self.kind, self._base, self._methods = kind, base, methods
         self._things: dict[str, T] = {}
 
-    def register(self, name: str) -> Callable[[T], T]:
+    def register(self, name: str) -> Callable[[K], K]:
         """A decorator that adds what it stands before.
 
         Raises:
             InvalidArgumentError: As :meth:`add`.
         """
-        return lambda thing: self.add(name, thing)
+
+        def added(thing: K) -> K:
+            self.add(name, cast("T", thing))
+            return thing
+
+        return added
 
     def add(self, name: str, thing: T) -> T:
         """Adds a thing; the same one again changes nothing.

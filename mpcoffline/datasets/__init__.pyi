@@ -12,7 +12,18 @@ from .interop.convert import (
     to_sb3_replay_buffer as to_sb3_replay_buffer,
     to_torchrl as to_torchrl,
 )
-from .recording.from_arrays import dataset_from_arrays as dataset_from_arrays
+from .interop.episodes import from_episodes as from_episodes
+from .interop.from_buffers import (
+    from_d3rlpy as from_d3rlpy,
+    from_dict as from_dict,
+    from_sb3_replay_buffer as from_sb3_replay_buffer,
+    from_torchrl as from_torchrl,
+)
+from .interop.from_steps import from_do_mpc as from_do_mpc, from_lerobot as from_lerobot, from_rlds as from_rlds
+from .recording.from_arrays import (
+    dataset_from_arrays as dataset_from_arrays,
+    dataset_from_table as dataset_from_table,
+)
 from .recording.from_csv import from_csv as from_csv
 from .recording.recorder import MinariRecorder as MinariRecorder
 from .recording.rollouts import record as record

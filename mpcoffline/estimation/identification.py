@@ -133,6 +133,12 @@ class OneStepProblem:
         min_z  mean_D[ |(s+ - f_th(z)(s,a)) / scale|^2 ] + prior |z|^2
     """
 
+    rows: Rows
+    scale: Array
+    model: OneStep
+    low: Array
+    high: Array
+
     def __init__(
         self, mpc: MPC, rows: Rows, centre: Array | float = 0.0, coordinates: Coordinates | None = None
     ) -> None:
@@ -140,11 +146,11 @@ class OneStepProblem:
         c = coordinates or Coordinates(mpc, ("model",), Scaling(rows.x, rows.u, self.scale))
         self.coordinates = c
         self.model, self._theta_0 = OneStep(mpc, c.mask), mpc.theta[c.mask]
-        self.free = np.flatnonzero(c.high > c.low)
+        self.free: NDArray[np.intp] = np.flatnonzero(c.high > c.low)
         self.low, self.high = c.low[self.free], c.high[self.free]
         names = [name for name, chosen in zip(mpc.space.names, c.mask, strict=True) if chosen]
-        self.names = [names[i] for i in self.free]
-        self.varying = mpc.space.varying[c.mask][self.free]
+        self.names: list[str] = [names[i] for i in self.free]
+        self.varying: NDArray[np.bool_] = mpc.space.varying[c.mask][self.free]
 
     def on(self, rows: Rows) -> OneStepProblem:
         """The same problem for other rows, in the same scale."""

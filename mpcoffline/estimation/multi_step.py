@@ -109,6 +109,9 @@ class MultiStepProblem:
         spread: Standard deviation of the prior in the scaled coordinates z.
     """
 
+    windows: Windows
+    coordinates: OneStepProblem
+
     def __init__(self, mpc: MPC, windows: Windows, coordinates: OneStepProblem, spread: float) -> None:
         self.windows, self.coordinates, self._spread = windows, coordinates, spread
         f, index = mpc.plant_function, np.flatnonzero(coordinates.coordinates.mask)[coordinates.free]
@@ -118,8 +121,8 @@ class MultiStepProblem:
         slopes = ca.jacobian(reached, theta)[:, index.tolist()]
         parts = [reached, *(ca.vec(ca.densify(part.T)) for part in (ca.jacobian(reached, x), slopes))]
         self._step = ca.Function("multi_step", [x, u, theta], parts)
-        self.operations = int(self._step.n_instructions())
-        self.count = int((windows.valid.sum() + len(windows)) * nx)
+        self.operations: int = int(self._step.n_instructions())
+        self.count: int = int((windows.valid.sum() + len(windows)) * nx)
 
     def simulated(self, z: Array, starts: Array, *, slopes: bool) -> _Pass:
         """All windows from their starts ``(W, nx)``; a window ends where its prediction is absurd."""

@@ -73,8 +73,8 @@ class OutputModel:
 
     def __init__(self, mpc: MPC, outputs: Outputs, n_disturbances: int = 0) -> None:
         n = mpc.layout.n_states
-        self.function = _outputs(outputs, n)
-        self.n_outputs = self.function.numel_out(0)
+        self.function: ca.Function = _outputs(outputs, n)
+        self.n_outputs: int = self.function.numel_out(0)
         (z, acting, theta), ahead = disturbed_plant(mpc, n_disturbances)
         self._ahead = _WithSlopes("ahead", [z, acting, theta], ahead)
         self._seen = _WithSlopes("seen", [z], self.function(z[:n]))
@@ -179,6 +179,11 @@ class KalmanObserver:
             states, noise of zero, more disturbances than outputs, or labels of another number.
     """
 
+    mpc: MPC
+    n_disturbances: int
+    function: ca.Function
+    n_outputs: int
+
     def __init__(
         self,
         mpc: MPC,
@@ -195,11 +200,11 @@ class KalmanObserver:
         self.mpc, self.n_disturbances = mpc, 0 if disturbance is None else mpc.nu
         self._model = OutputModel(mpc, outputs, self.n_disturbances)
         self.function, self.n_outputs, self._theta = self._model.function, self._model.n_outputs, mpc.theta
-        self.noise = _spreads("noise", noise, self.n_outputs, positive=True)
-        self.process = _spreads("process", process, n)
-        self.start = at_rest(mpc)[:n] if start is None else _vector("start", start, n)
-        self.start_spread = _spreads("start_spread", start_spread, n)
-        self.disturbance = None if disturbance is None else _spreads("disturbance", disturbance, mpc.nu)
+        self.noise: Array = _spreads("noise", noise, self.n_outputs, positive=True)
+        self.process: Array = _spreads("process", process, n)
+        self.start: Array = at_rest(mpc)[:n] if start is None else _vector("start", start, n)
+        self.start_spread: Array = _spreads("start_spread", start_spread, n)
+        self.disturbance: Array | None = None if disturbance is None else _spreads("disturbance", disturbance, mpc.nu)
         if self.n_disturbances > self.n_outputs:
             raise InvalidArgumentError(
                 "disturbance",
@@ -207,7 +212,7 @@ class KalmanObserver:
                 actual=f"{self.n_disturbances} inputs",
                 hint="More cannot be told apart. disturbance=None leaves them out.",
             )
-        self.labels = self._labels(outputs, labels)
+        self.labels: tuple[Label, ...] = self._labels(outputs, labels)
         missed = self.process if self.disturbance is None else np.append(self.process, self.disturbance)
         self._Q, self._R = np.diag(missed**2), np.diag(self.noise**2)
 

@@ -36,7 +36,7 @@ class Checkpoint:
         check_output(path)
         self._path, self._identity = Path(path), identity
         self._run: tuple[dict[str, Any], dict[str, NDArray[Any]]] = {}, {}
-        self.kept = Kept(self)
+        self.kept: Kept = Kept(self)
 
     def resume(self, run: Run) -> History:
         """Takes a run to where the file says, if there is one; returns the history until then.

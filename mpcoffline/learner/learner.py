@@ -90,8 +90,7 @@ class OfflineMPCLearner:
             dear. None, the default, leaves hard limits hard.
         keep_limits: In which share of the steps of closed loops on models of the log the given limits are to be kept,
             e.g. 0.95: those of the best candidate are made tighter until they are (chance constraints by back-off);
-            ``findings`` and report say by how much. None, the default, leaves them as they are. It needs
-            ``candidate="auto"``.
+            ``findings`` and report say by how much. None leaves them as they are. It needs ``candidate="auto"``.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
@@ -110,12 +109,8 @@ class OfflineMPCLearner:
     Attributes:
         method: The learning method with its options.
         preset: The name of the preset; None where a method was given.
-        candidate: As given.
-        polish: As given.
-        soften: As given.
-        keep_limits: As given.
-        candidates: The MPCs that could be handed out, and how they did on models of the log; None before ``fit``, and
-            where the method knows of none but the whole fit.
+        candidate, polish, soften, keep_limits: As given.
+        candidates: What could be handed out, and how it did on models of the log; None before ``fit``, without choice.
         sensors: What ``output_policy`` sees in place of states; None where states were learned from.
     """
 
@@ -142,16 +137,21 @@ class OfflineMPCLearner:
         if value_function is not None and value_function.ny != mpc.nx:
             expected, actual = f"a function of {mpc.nx} coordinates", str(value_function.ny)
             raise InvalidArgumentError("value_function", expected=expected, actual=actual)
-        self.preset = preset if method is None else None
-        self.method = method_of(preset, method, options if value is None else options | {"value": value})
-        self.nominal_mpc, self.learn, self.seed, self.device = mpc, learn, int(seed), device
-        self.candidate, self.polish = check_name("candidate", candidate), bool(polish)
+        self.preset: str | None = preset if method is None else None
+        self.method: Method = method_of(preset, method, options if value is None else options | {"value": value})
+        self.nominal_mpc: MPC = mpc
+        self.learn: Learn = learn
+        self.seed: int = int(seed)
+        self.device: str = device
+        self.candidate: str = check_name("candidate", candidate)
+        self.polish: bool = bool(polish)
         if keep_limits is not None:
             check_number("keep_limits", keep_limits, 0.0, 1.0)
         for name, asked in (("keep_limits", keep_limits is not None), ("polish", self.polish)):
             if asked and candidate != "auto":
                 raise InvalidArgumentError("candidate", expected=f"'auto' with {name}", actual=repr(candidate))
-        self.soften, self.keep_limits = check_soften(soften), keep_limits
+        self.soften: Soften | None = check_soften(soften)
+        self.keep_limits: float | None = keep_limits
         self.softening: Softening | None = None
         self.start: MPC | None = None  # of the last fit
         self.candidates: Candidates | None = None

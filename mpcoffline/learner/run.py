@@ -59,6 +59,8 @@ class Run:
         result: What was found, once all is done.
     """
 
+    method: Method
+
     def __init__(self, method: Method, start: Known) -> None:
         mpc = start.mpc
         for data in (start.table, start.shards):

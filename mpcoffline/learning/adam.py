@@ -30,6 +30,9 @@ class Adam:
             none before the first step.
     """
 
+    tensors: list[Tensor]
+    learning_rate: float
+
     def __init__(self, tensors: Sequence[Tensor], learning_rate: float = 1e-3, *, fused: bool = False) -> None:
         self.tensors, self.learning_rate, self._fused = list(tensors), learning_rate, fused
         self.state: dict[Tensor, dict[str, Tensor]] = {}

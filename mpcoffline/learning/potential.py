@@ -33,7 +33,7 @@ class Potential:
         std, self._mean = torch.std_mean(observations.double(), dim=0, correction=0)
         self._scale = torch.where(std > 0.0, std, 1.0)
         self._pairs = torch.triu_indices(len(self._mean), len(self._mean))
-        self.coefficients = torch.zeros(len(self._mean) + self._pairs.shape[1], dtype=torch.float64)
+        self.coefficients: Tensor = torch.zeros(len(self._mean) + self._pairs.shape[1], dtype=torch.float64)
 
     def to_json(self) -> dict[str, list[float]]:
         """A JSON-able description."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.core.types import Array
@@ -30,18 +31,21 @@ class Coordinates:
         scaling: The units of the data.
     """
 
+    low: Array
+    high: Array
+
     def __init__(self, mpc: MPC, groups: tuple[str, ...], scaling: Scaling) -> None:
         space = mpc.space
-        self.mask = space.mask(groups)
+        self.mask: NDArray[np.bool_] = space.mask(groups)
         theta, low, high = (v[self.mask] for v in (space.theta, space.low, space.high))
         factor = np.array([b.kind == "psd" for b in space for _ in range(b.size)], dtype=bool)[self.mask]
         self._stuck = factor & (low == 0.0) & (theta == 0.0)
         low = np.where(factor, -np.inf, low)
         self._bounds = np.stack([low, high], axis=1)
         self._names = [name for name, learned in zip(space.names, self.mask, strict=True) if learned]
-        self.logarithmic = (low > 0.0) & (theta > 0.0)
+        self.logarithmic: NDArray[np.bool_] = (low > 0.0) & (theta > 0.0)
         self._sizes = scaling.units(mpc, groups)[self.mask]
-        self.scale = np.where(self.logarithmic, 1.0, self._sizes)
+        self.scale: Array = np.where(self.logarithmic, 1.0, self._sizes)
         self._theta_0 = theta
         self._full = space.theta
         with np.errstate(divide="ignore", invalid="ignore"):

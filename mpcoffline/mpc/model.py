@@ -96,20 +96,18 @@ class Model(Component):
             raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
         if discrete and integrator != "auto":
             raise InvalidArgumentError("integrator", expected="none for a discrete map", actual=repr(integrator))
-        self.dt, self.layout, self.delay = float(dt), layout, None if delay is None else layout.delay
+        self.dt: float = float(dt)
+        self.layout: Layout = layout
+        self.delay: tuple[int, ...] | None = None if delay is None else layout.delay
         blocks = [Block.free(name, value, "model") for name, value in (parameters or {}).items()]
-        self.space = ParameterSpace(blocks)
+        self.space: ParameterSpace = ParameterSpace(blocks)
         function = self._traced(dynamics)
         if discrete:
             self._take(function, "map", None)
         else:
             asked = None if integrator == "auto" else Scheme.of(integrator)
-            self._take(
-                function,
-                integrator,
-                first_scheme(function, self.dt, self.space.theta, asked),
-                settled=asked is not None,
-            )
+            scheme = first_scheme(function, self.dt, self.space.theta, asked)
+            self._take(function, integrator, scheme, settled=asked is not None)
 
     @classmethod
     def from_torch(
@@ -170,19 +168,22 @@ class Model(Component):
                 ) from error
             return x + out if residual else out
 
-        parameters = network.weights if learn_weights else None
-        is_map = discrete or residual
         options: dict[str, Any] = {"integrator": integrator, "delay": delay, "signals": signals}
-        return cls(dynamics, nx, nu, dt, parameters, discrete=is_map, **options)
+        parameters = network.weights if learn_weights else None
+        return cls(dynamics, nx, nu, dt, parameters, discrete=discrete or residual, **options)
 
     def _take(self, function: ca.Function, integrator: str, scheme: Scheme | None, *, settled: bool = True) -> None:
         """Takes an ODE with its scheme, or without one a map as it is."""
-        self.ode, self.integrator, self.scheme = None if scheme is None else function, integrator, scheme
-        self.settled = settled or scheme is None or scheme.kind == "exact"
+        self.ode: ca.Function | None = None if scheme is None else function
+        self.integrator: str = integrator
+        self.scheme: Scheme | None = scheme
+        self.settled: bool = settled or scheme is None or scheme.kind == "exact"
         self._lay_out(self.layout, self._discretised(function))
 
     def _lay_out(self, layout: Layout, plant: ca.Function) -> None:
-        self.layout, self.plant, self.function = layout, plant, layout.wrapped(plant)
+        self.layout = layout
+        self.plant: ca.Function = plant
+        self.function: ca.Function = layout.wrapped(plant)
 
     @property
     def nx(self) -> int:

@@ -256,7 +256,7 @@ class ParameterSpace(Sequence[Block]):
     """
 
     def __init__(self, blocks: Sequence[Block]) -> None:
-        self.blocks = tuple(blocks)
+        self.blocks: tuple[Block, ...] = tuple(blocks)
         self.slices: dict[str, slice] = {}
         start = 0
         for block in self.blocks:

@@ -70,6 +70,9 @@ class Flow:
         theta: The model's flat parameters.
     """
 
+    ode: ca.Function
+    dt: float
+
     def __init__(self, ode: ca.Function, dt: float, theta: Array) -> None:
         self.ode, self.dt, self._theta = ode, dt, theta
         x, u, p = (ca.SX.sym(f"i{i}", *ode.size_in(i)) for i in range(3))

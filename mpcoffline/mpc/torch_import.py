@@ -93,6 +93,8 @@ class TorchExpression:
         InvalidArgumentError: For a module that ``torch.fx`` cannot trace.
     """
 
+    weights: dict[str, Array]
+
     def __init__(self, module: Any) -> None:
         import torch
         from torch import fx

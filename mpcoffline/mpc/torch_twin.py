@@ -96,7 +96,7 @@ class TorchTwin:
     """
 
     def __init__(self, function: ca.Function) -> None:
-        self.name = function.name()
+        self.name: str = function.name()
         flat = expanded(function)
         self._n_in = [flat.numel_in(i) for i in range(flat.n_in())]
         self._n_out = flat.numel_out(0)

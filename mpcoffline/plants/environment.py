@@ -70,7 +70,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if plant not in _DESCRIBED:
             hint = "Run what describes it first, as mpcoffline.plants.load_plant(file).env()."
             raise UnknownIdError.of("plant of an environment", plant, _DESCRIBED, hint)
-        self.plant = _DESCRIBED[plant]
+        self.plant: Plant = _DESCRIBED[plant]
         check_number("noise", noise, 0.0, open_low=False)
         check_number("spread", spread, 0.0, open_low=False)
         self._courses = dict(signals or {})

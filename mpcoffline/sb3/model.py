@@ -110,7 +110,7 @@ class MPCModel(BaseAlgorithm):
         """
         wrapped = self._wrap_env(_given(env, self.verbose), self.verbose)
         check_spaces(self.policy, wrapped)
-        self.n_envs = wrapped.num_envs
+        self.n_envs: int = wrapped.num_envs
         self.observation_space, self.action_space = wrapped.observation_space, wrapped.action_space
         super().set_env(wrapped, force_reset)
         self.policy = self.policy.with_normalization(wrapped)

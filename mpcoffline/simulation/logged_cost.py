@@ -10,10 +10,11 @@ from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.learning.known_cost import COST_ROWS, agreeing_cost, as_applied
 from mpcoffline.learning.known_limits import limit_costs_of
+from mpcoffline.learning.limit_costs import LimitCosts
 from mpcoffline.learning.stages import ROUNDING, KnownCost
 from mpcoffline.mpc import MPC
 
-from .cost_ends import learned_ends
+from .cost_ends import Ends, learned_ends
 from .cost_regression import CostRegression, cost_regressions, folds_of
 
 _ROWS = 20_000
@@ -50,6 +51,8 @@ class LoggedCost:
         ends: Where episodes end, and at what price.
     """
 
+    low: float
+
     def __init__(
         self,
         table: TransitionTable,
@@ -60,7 +63,7 @@ class LoggedCost:
         logged: TransitionTable | None = None,
     ) -> None:
         table = table if logged is None else logged
-        self.limits = None if mpc is None else limit_costs_of(mpc, excerpt(table, COST_ROWS, seed))
+        self.limits: LimitCosts | None = None if mpc is None else limit_costs_of(mpc, excerpt(table, COST_ROWS, seed))
         table = table if self.limits is None else self.limits.without(table)
         self._seen = table.ny if seen is None else seen
         agreeing = None if mpc is None else _agreeing(mpc, excerpt(table, COST_ROWS, seed))
@@ -78,12 +81,12 @@ class LoggedCost:
         if self.known is None or self.known.missed > ROUNDING:
             self._regressions = self._regressed(rows, self._reached, seed)
         self._others = self._regressions[0 if self.known is not None else 1 :] or self._regressions
-        self.r2 = 1.0 - (self._regressions[0].error if self.known is None else self.known.missed)
-        self.r2_second = 1.0 - self._others[0].error if self._others else self.r2
-        self.exact = self.known is not None or self._regressions[0].exact
+        self.r2: float = 1.0 - (self._regressions[0].error if self.known is None else self.known.missed)
+        self.r2_second: float = 1.0 - self._others[0].error if self._others else self.r2
+        self.exact: bool = self.known is not None or self._regressions[0].exact
         last = table.take(np.flatnonzero(over)).values()
         prices = last.costs - self._stage(last.observations, last.actions, last.next_observations)
-        self.ends = learned_ends(table, prices, seed, self._seen)
+        self.ends: Ends = learned_ends(table, prices, seed, self._seen)
 
     def __call__(self, s: Array, a: Array, reached: Array) -> Array:
         """L of states ``(B, nx)``, inputs ``(B, nu)`` and states reached ``(B, nx)``, ``(B,)``.

@@ -39,6 +39,8 @@ class Members:
         kept: Move successors to where states can be, one after the other.
     """
 
+    thetas: Array
+
     def __init__(
         self,
         mpc: MPC,

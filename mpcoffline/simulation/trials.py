@@ -213,6 +213,15 @@ class Surroundings:
         sensors: What MPCs see in place of states, through an observer, which begins with the episode.
     """
 
+    models: LogModels
+    cost: LoggedCost
+    rows: NDArray[np.intp]
+    n_steps: int
+    table: TransitionTable
+    usual: int
+    n_before: int
+    fresh: bool
+
     def __init__(
         self,
         models: LogModels,
@@ -229,23 +238,23 @@ class Surroundings:
         fresh: bool = False,
         sensors: Sensors | None = None,
     ) -> None:
-        self.logged = table if logged is None else logged
+        self.logged: TransitionTable = table if logged is None else logged
         self.models, self.cost, self.rows, self.n_steps, self._layout = models, cost, rows, n_steps, layout
         self.table, self.usual, self.n_before, self.fresh = table, len(rows) - spare, n_before, fresh
-        self.before = np.zeros(len(rows)) if before is None else before
+        self.before: Array = np.zeros(len(rows)) if before is None else before
         columns = table.values()
-        self.starts = columns.observations[rows]
-        self.signals = signals_along(table, rows, n_steps, layout)
-        self.disturbances = models.replayed(table, rows, n_steps, cost.as_applied)
+        self.starts: Any = columns.observations[rows]
+        self.signals: Array = signals_along(table, rows, n_steps, layout)
+        self.disturbances: Array = models.replayed(table, rows, n_steps, cost.as_applied)
         rng = np.random.default_rng([seed, _NOISE])
-        self.noise = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
+        self.noise: Array = models.noise * rng.standard_normal((n_steps, len(rows), layout.n_states))
         self.sensors = sensors
         if sensors is not None:
-            self.output_noise = sensors.noise * rng.standard_normal((n_steps, len(rows), sensors.n_outputs))
+            self.output_noise: Array = sensors.noise * rng.standard_normal((n_steps, len(rows), sensors.n_outputs))
         paid = table if cost.limits is None else cost.limits.whole(table)
-        self.returns = returns_along(paid, rows, n_steps) + self.before
-        self.begun = np.isin(rows, table.episodes.firsts)
-        self.at_work = np.zeros(len(rows), dtype=bool)
+        self.returns: Array = returns_along(paid, rows, n_steps) + self.before
+        self.begun: NDArray[np.bool_] = np.isin(rows, table.episodes.firsts)
+        self.at_work: NDArray[np.bool_] = np.zeros(len(rows), dtype=bool)
         states = columns.observations
         self._middle, spread = states.mean(axis=0), states.std(axis=0)
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread

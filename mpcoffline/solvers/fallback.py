@@ -126,13 +126,17 @@ class Fallback:
         InvalidArgumentError: For a time that is not positive.
     """
 
+    mpc: MPC
+    rescue_time: float
+    most_retried: float
+
     def __init__(self, mpc: MPC, rescue: str | None = None, rescue_time: float = 1.0) -> None:
         if rescue is not None and rescue not in RESCUES:
             raise UnknownIdError.of("rescue", rescue, RESCUES)
         if not 0.0 < rescue_time < np.inf:
             raise InvalidArgumentError("rescue_time", expected="a positive number of seconds", actual=str(rescue_time))
         self.mpc, self.rescue, self.rescue_time = mpc, rescue, float(rescue_time)
-        self.stats = SolverStats()
+        self.stats: SolverStats = SolverStats()
         self.most_retried, self._n_tried_again = 1.0, 0
         self.level = logging.WARNING
         self._rescuer: IpoptSolver | None = None

@@ -108,6 +108,9 @@ class Solver(ABC):
         InvalidArgumentError: For a problem that :meth:`refuses` names a reason against.
     """
 
+    mpc: MPC
+    options: dict[str, Any]
+
     relative_speed: ClassVar[float] = 1.0
     needs_compiler: ClassVar[bool] = False
     theta_dimensions: ClassVar[tuple[int, ...]] = (1,)

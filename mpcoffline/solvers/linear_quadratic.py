@@ -243,6 +243,10 @@ class Riccati:
         kappa: Offsets, ``(N, nu)``.
     """
 
+    p: Array
+    v: Array
+    kappa: Array
+
     def __init__(self, problem: LinearQuadratic) -> None:
         self.problem = problem
         n, nx, nu = problem.B.shape
@@ -250,7 +254,7 @@ class Riccati:
         self.K, self.kappa = np.empty((n, nu, nx)), np.empty((n, nu))
         self._factors = np.empty((n, nu, nu))  # C with Muu = C C'
         self.P[n], self.p[n], self.v[n] = problem.W, problem.w, problem.t
-        self.definite = self._recursion()
+        self.definite: bool = self._recursion()
 
     def _recursion(self) -> bool:
         """Fills all attributes from the last stage to the first; False where a Muu is not positive definite."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from hypothesis import given, settings, strategies as st
 from lq_plant import make_mpc, random_log
@@ -52,6 +53,17 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(arrays[name], array)
         assert arrays[name].dtype == array.dtype
+
+
+@pytest.mark.parametrize("order", [">", "<"])
+def test_arrays_of_another_machine_are_read_in_this_ones_order_of_bytes(tmp_path: Path, order: str) -> None:
+    """Of a file from a machine that keeps numbers the other way round; torch takes no such arrays."""
+    path = tmp_path / "x.zip"
+    write_archive(path, "thing", DOCUMENT, {name: a.astype(a.dtype.newbyteorder(order)) for name, a in ARRAYS.items()})
+    for name, array in read_archive(path, "thing")[1].items():
+        assert array.dtype == ARRAYS[name].dtype
+        assert array.dtype.isnative
+        np.testing.assert_array_equal(torch.from_numpy(np.atleast_1d(array)), np.atleast_1d(ARRAYS[name]))
 
 
 def test_equal_contents_give_equal_bytes(tmp_path: Path) -> None:

@@ -122,6 +122,9 @@ class LineServer:
         port: Port; 0 for a free one.
     """
 
+    host: str | bytes | bytearray
+    port: int
+
     def __init__(self, device: Device, host: str = "127.0.0.1", port: int = 0) -> None:
         lock, connections = threading.Lock(), set[socket.socket]()
         self._connections = connections

@@ -128,11 +128,11 @@ class Service:
     ) -> None:
         mpc, layout = policy.mpc, policy.mpc.layout
         labels = policy.y_labels
-        self.period = float(mpc.model.dt if period is None else period)
+        self.period: float = float(mpc.model.dt if period is None else period)
         check_number("period", self.period, 0.0)
         check_integers(0, hold=hold)
         check_integers(1, transfer=transfer)
-        self.deadline = _TIMELY * self.period if deadline is None else float(deadline)
+        self.deadline: float = _TIMELY * self.period if deadline is None else float(deadline)
         check_number("deadline", self.deadline, 0.0, self.period)
         self._low, self._high = np.asarray(mpc.action_low), np.asarray(mpc.action_high)
         self._names, self._signals = [label.name for label in layout.u_labels], layout.signals
@@ -143,7 +143,7 @@ class Service:
         self._hold, self._transfer, self._log = hold, transfer, log
         self._clock: Clock = SystemClock() if clock is None else clock
         self._tell = tell or (lambda _: None)
-        self.stats = ServiceStats()
+        self.stats: ServiceStats = ServiceStats()
         self._applied = np.array(mpc.usual_input, dtype=np.float64)
         self._taken_over = self._wrong = self._unsure = False
         self._without = self._blended = 0

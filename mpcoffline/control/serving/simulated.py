@@ -35,6 +35,8 @@ class SimulatedDevice:
         InvalidArgumentError: For an environment of other sizes than the MPC's.
     """
 
+    cost: float
+
     def __init__(
         self,
         env: gym.Env[Any, Any],

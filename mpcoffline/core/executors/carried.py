@@ -26,8 +26,8 @@ class Carried:
     """
 
     def __init__(self, fn: Callable[[Any], Any], dumps: Callable[[Any], bytes] = pickle.dumps) -> None:
-        self.content = dumps(fn)
-        self.key = hashlib.sha256(self.content).hexdigest()
+        self.content: bytes = dumps(fn)
+        self.key: str = hashlib.sha256(self.content).hexdigest()
 
 
 def done_with(key: str, content: bytes, job: Any) -> Outcome:

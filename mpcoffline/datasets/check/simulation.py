@@ -59,12 +59,17 @@ class Simulation:
         skipped: Episodes that could not be simulated, each with the reason.
     """
 
+    env: gym.Env[Any, Any]
+    name: str
+    episodes: int
+    steps: int
+
     def __init__(self, env: Env, dataset: MinariDataset) -> None:
         self.env, self._dataset, self.name = env, dataset, f"data set {dataset.spec.dataset_id!r}"
-        self.task = env.unwrapped if isinstance(env.unwrapped, ControlTask) else None
+        self.task: ControlTask | None = env.unwrapped if isinstance(env.unwrapped, ControlTask) else None
         self.episodes = self.steps = 0
-        self.free_run = dict.fromkeys(QUANTITIES, Deviation())
-        self.one_step = dict.fromkeys(QUANTITIES, Deviation())
+        self.free_run: dict[str, Deviation] = dict.fromkeys(QUANTITIES, Deviation())
+        self.one_step: dict[str, Deviation] = dict.fromkeys(QUANTITIES, Deviation())
         self.wrong_ends: list[int] = []
         self.skipped: list[tuple[int, str]] = []
         self._compared: dict[int, set[str]] = {}

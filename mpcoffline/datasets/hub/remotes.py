@@ -123,6 +123,8 @@ class HuggingFace:
         token: For private data; None for that of ``hf auth login``, if any.
     """
 
+    url: str
+
     def __init__(self, name: str, token: str | None = None) -> None:
         from huggingface_hub import HfApi
 
@@ -180,6 +182,8 @@ class GoogleCloud:
         name: The bucket.
         token: Path of a service account's key file; None for public data.
     """
+
+    url: str
 
     def __init__(self, name: str, token: str | None = None) -> None:
         from minari.storage.remotes.gcp import GCPStorage

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.core.types import Array
-from mpcoffline.datasets.recording.from_arrays import dataset_from_arrays
+from mpcoffline.datasets.recording.from_arrays import dataset_from_table
 from mpcoffline.datasets.table.arrays import packed_blocks
 from mpcoffline.datasets.table.math import CHUNK
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -59,20 +59,15 @@ class LoggedTable(TransitionTable):
         Raises:
             InvalidArgumentError: For a bad id, or one that exists.
         """
-        columns = self.values()
-        _, firsts, lengths = self.episodes
-        parts = (slice(int(a), int(a + n)) for a, n in zip(firsts, lengths, strict=True))
-        episodes = [
-            (
-                np.vstack([columns.observations[p], columns.next_observations[p][-1:]]),
-                columns.actions[p],
-                columns.costs[p],
-            )
-            for p in parts
-        ]
         low, high = self.action_bounds
-        how: dict[str, Any] = {"description": f"Log {self.name}.", "names": self.names, "overwrite": overwrite}
-        return dataset_from_arrays(dataset_id, episodes, action_low=low, action_high=high, **how)
+        return dataset_from_table(
+            dataset_id,
+            self,
+            action_low=low,
+            action_high=high,
+            description=f"Log {self.name}.",
+            overwrite=overwrite,
+        )
 
 
 def read_log(sources: Any, wanted: Wanted, options: Options) -> LoggedTable:

@@ -47,6 +47,11 @@ class Clock:
         said: What was found out, in words.
     """
 
+    absolute: bool
+    zoned: bool
+    unitless: bool
+    said: str
+
     def __init__(self, where: str, unit: str | None, form: str | None) -> None:
         self._where, self._unit, self._form = where, unit, form
         self._kind = ""

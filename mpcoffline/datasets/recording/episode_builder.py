@@ -34,6 +34,8 @@ class EpisodeBuilder:
         InvalidDataError: For an observation that is not an array of numbers.
     """
 
+    returned: float
+
     def __init__(self, observation: ArrayLike, info: Mapping[str, Any], rule: PlantInfo) -> None:
         self._rule = rule
         self._observations = [np.array(check_numbers("first observation", observation))]

@@ -13,7 +13,9 @@ from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets.store.names import checked_names
 from mpcoffline.datasets.store.writing import episode_of, write_dataset
 from mpcoffline.datasets.table.arrays import types_that_hold
+from mpcoffline.datasets.table.excerpts import stretches
 from mpcoffline.datasets.table.numbers import floats
+from mpcoffline.datasets.table.transitions import TransitionTable
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -85,6 +87,53 @@ def dataset_from_arrays(
         action_space=spaces.Box(low, high, (nu,), action_type),
         description=description,
         names=called,
+        overwrite=overwrite,
+    )
+
+
+def dataset_from_table(
+    dataset_id: str,
+    table: TransitionTable,
+    *,
+    action_low: ArrayLike = -np.inf,
+    action_high: ArrayLike = np.inf,
+    description: str | None = None,
+    overwrite: bool = False,
+) -> MinariDataset:
+    """Stores the transitions of a table as a Minari data set, with the names of its columns.
+
+    What does not go on from the row before begins a new episode.
+
+    Args:
+        dataset_id: Minari id of the new data set.
+        table: The transitions.
+        action_low: Lower bounds of the actions, ``(nu,)`` or a number.
+        action_high: Upper bounds of the actions.
+        description: Stored as metadata.
+        overwrite: Whether an existing data set of this id may be replaced.
+
+    Raises:
+        InvalidArgumentError: For a bad id, or one that exists.
+        InvalidDataError: For an action out of bounds.
+        StorageError: Where the disk refuses.
+    """
+    columns = table.values()
+    parts = stretches(table)
+    return dataset_from_arrays(
+        dataset_id,
+        [
+            (
+                np.vstack([columns.observations[p], columns.next_observations[p][-1:]]),
+                columns.actions[p],
+                columns.costs[p],
+            )
+            for p in parts
+        ],
+        action_low=action_low,
+        action_high=action_high,
+        terminated=[bool(columns.terminations[p][-1] > 0.0) for p in parts],
+        description=description,
+        names=table.names,
         overwrite=overwrite,
     )
 

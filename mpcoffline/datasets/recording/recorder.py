@@ -88,6 +88,9 @@ class MinariRecorder(BaseCallback):
         ``agent.learn(50_000, callback=MinariRecorder("mpcoffline/pendulum/mine-v0"))``
     """
 
+    sync_episodes: int
+    sync_seconds: float
+
     leftover: ClassVar[str] = "refuse"
     origin: Mapping[str, Any] | None = None
 

@@ -92,7 +92,7 @@ class Recording:
             "keep_cut": keep_cut,
         }
         self._logs: dict[int, EpisodeLog] = {}
-        self.header = LogHeader(
+        self.header: LogHeader = LogHeader(
             dataset_id,
             uuid.uuid4().hex,
             mode,
@@ -113,7 +113,7 @@ class Recording:
                 self.header = indices[0].header
             else:
                 indices = []
-            self.resumed = sum(len(index.records) - (0 if keep_cut else len(index.cut)) for index in indices)
+            self.resumed: int = sum(len(index.records) - (0 if keep_cut else len(index.cut)) for index in indices)
             self._sequence = max((e.sequence + 1 for index in indices for e in index.episodes()), default=0)
         except BaseException:
             self._lock.release()

@@ -71,6 +71,9 @@ class PlantInfo:
         has_state: Whether states count; None before the first step.
     """
 
+    name: str
+    key: str
+
     def __init__(self, name: str, cost_key: str | None = None) -> None:
         if cost_key is not None and not isinstance(cost_key, str):
             raise InvalidArgumentError("cost_key", expected="the name of a key of info", actual=repr(cost_key))

@@ -54,6 +54,9 @@ class VecWatch:
         terminal: By environment, the last observation of an episode that has ended.
     """
 
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
     def __init__(self, env: VecEnv, name: str) -> None:
         chain = [env]
         while isinstance(chain[-1], VecEnvWrapper):

@@ -89,12 +89,14 @@ class PlantWatch:
         wrapped: Whether there is something between the environment and its plant.
     """
 
+    env: gym.Env[Any, Any]
+
     def __init__(self, env: Env) -> None:
         self.reward: float | None = None
         self.observation: Any = None
         self.action: Any = None
         self.env, plant = env, plant_of(env)
-        self.wrapped = plant is not env and bool(wrappers_around(env))
+        self.wrapped: bool = plant is not env and bool(wrappers_around(env))
         self._depth = 0
         self._shadows: list[Shadow] = []
         try:

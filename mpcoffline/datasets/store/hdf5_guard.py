@@ -298,10 +298,10 @@ class _Walk:
             if kind.detect_class(h5py.h5t.VLEN):
                 raise self._refused(where, "numbers or texts", str(array.dtype))
             return
-        if array.ndim != 1:
+        if array.ndim > 1:
             raise self._refused(where, "one text a row", f"shape {array.shape}")
-        first, left = 0, self._bytes_left
-        while first < len(array):
+        first, left, n = 0, self._bytes_left, len(array) if array.ndim else 0  # one text is no larger than its file
+        while first < n:
             count = min(4096, max(1, left // (4 * len(self._content))))
             left -= sum(len(text) for text in array[first : first + count])
             first += count

@@ -81,7 +81,7 @@ class RecordingLock:
     """
 
     def __init__(self, dataset_id: str) -> None:
-        self.folder = recording_path(dataset_id)
+        self.folder: Path = recording_path(dataset_id)
         self._path = self.folder / "lock"
         self._fd = -1
         _OPEN.add(self)

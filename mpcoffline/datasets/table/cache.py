@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -32,7 +33,7 @@ from mpcoffline.datasets.store.manifest import sha256_of
 
 from .centring import Centring
 
-VERSION = 3
+VERSION = 3 if sys.byteorder == "little" else -3  # rows lie there as this machine keeps numbers
 READ_BYTES = 1 << 18
 _ROWS, _IDS, _META = "rows.f32", "episodes.i64", "table.json"
 
@@ -55,6 +56,10 @@ class TableFile:
         FileFormatError: For a folder that is not such a table, of another version, or with files of another size.
     """
 
+    ny: int
+    nu: int
+    block_rows: int
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
@@ -72,8 +77,8 @@ class TableFile:
             self._fd = open_own(folder / _ROWS)
             weakref.finalize(self, os.close, self._fd)
             shape = (n, 2 * self.ny + self.nu + 2)
-            self.row_bytes = 4 * shape[1]
-            self.centring = Centring.from_json(meta["centring"])
+            self.row_bytes: int = 4 * shape[1]
+            self.centring: Centring = Centring.from_json(meta["centring"])
             if (self.centring.centre.shape, self.centring.increments.shape) != ((shape[1],), (self.ny,)):
                 raise ValueError("centres of another width")
             with os.fdopen(open_own(folder / _IDS), "rb") as ids_file, os.fdopen(os.dup(self._fd), "rb") as rows_file:

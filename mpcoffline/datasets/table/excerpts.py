@@ -1,6 +1,8 @@
-"""An excerpt of a large table for what looks at rows one after another."""
+"""Parts of a table: an excerpt of a large one for what looks at rows one after another, and its runs."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 
@@ -23,3 +25,10 @@ def excerpt(table: TransitionTable, rows: int, seed: int) -> TransitionTable:
     chosen = np.sort(np.random.default_rng(seed).permutation(n_blocks)[:wanted])
     taken = (chosen[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
     return table.take(taken[taken < len(table)])
+
+
+def stretches(table: TransitionTable) -> list[slice]:
+    """The runs of rows in which each goes on from the one before, in their order."""
+    within = (table.episode_ids[1:] == table.episode_ids[:-1]) & table.goes_on() & (table.terminations[:-1] == 0.0)
+    begins = [0, *(np.flatnonzero(~within) + 1).tolist(), len(table)]
+    return [slice(a, b) for a, b in itertools.pairwise(begins)]

@@ -92,6 +92,10 @@ class Moments:
         squares: ``(size,)``.
     """
 
+    count: int
+    mean: Any
+    squares: Any
+
     def __init__(self, size: int) -> None:
         self.count, self.mean, self.squares = 0, np.zeros(size), np.zeros(size)
 

@@ -10,6 +10,26 @@ from mpcoffline.core.notebook import html_of
 from mpcoffline.core.tables import Table
 
 
+class Shown:
+    """What a table of transitions is called, and how notebooks show it.
+
+    Attributes:
+        ny: Number of observation coordinates.
+        nu: Number of action coordinates.
+        name: What error messages call it.
+        names: Names and units of the columns, observations first; none where nobody said.
+    """
+
+    def __init__(self, ny: int, nu: int, name: str, names: tuple[str, ...]) -> None:
+        self.ny: int = ny
+        self.nu: int = nu
+        self.name: str = name
+        self.names: tuple[str, ...] = names
+
+    def _repr_html_(self) -> str:
+        return html_of_rows(self)
+
+
 def html_of_rows(table: Any) -> str:
     """Columns, by name and unit where these are known, and what they range over.
 

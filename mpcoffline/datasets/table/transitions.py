@@ -20,7 +20,7 @@ from .centring import Centring
 from .math import CHUNK, Columns, Episodes, TableStatistics, drawn_episodes, innermost, moments, split
 from .numbers import check_bounds, check_sizes
 from .sampler import block_batches, gather_batches
-from .shown import html_of_rows
+from .shown import Shown
 
 __all__ = ["Columns", "Episodes", "TableStatistics", "TransitionTable"]
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 
-class TransitionTable:
+class TransitionTable(Shown):
     """Transitions (s, a, L, s+, terminated) as one C-contiguous float32 array ``(n, 2 ny + nu + 2)``.
 
     :attr:`rows` and :meth:`batches` are that array, for speed; everything else is in units. Columns that are small
@@ -66,10 +66,11 @@ class TransitionTable:
         memory: int | None = None,
         names: tuple[str, ...] = (),
     ) -> None:
-        self._rows, self.ny, self.nu, self._episode_ids, self.name = rows, ny, nu, episode_ids, name
-        self.centring = Centring.none(ny, nu) if centring is None else centring
+        super().__init__(ny, nu, name, names)
+        self._rows, self._episode_ids = rows, episode_ids
+        self.centring: Centring = Centring.none(ny, nu) if centring is None else centring
         self._plain = self.centring.is_none
-        self._file, self._memory, self.names = file, memory, names
+        self._file, self._memory = file, memory
 
     @property
     def rows(self) -> NDArray[np.float32]:
@@ -92,8 +93,6 @@ class TransitionTable:
     def __repr__(self) -> str:
         what = f"; {', '.join(self.names)}" if self.names else f", ny={self.ny}, nu={self.nu}"
         return f"{type(self).__name__}({self.name!r}, n={len(self)}{what})"
-
-    _repr_html_ = html_of_rows
 
     @property
     def observations(self) -> NDArray[np.floating[Any]]:

@@ -33,6 +33,9 @@ class BellmanProblem:
         cost: How L follows from Lhat, where that is known: then ``scale Lhat`` stands for Lhat here.
     """
 
+    n_states: int
+    unit: float
+
     def __init__(self, mpc: MPC, value: ValueFunction, unit: float, cost: KnownCost | None = None) -> None:
         self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
         self.n_states, self._ny = mpc.layout.n_states, mpc.ny

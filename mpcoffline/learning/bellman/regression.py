@@ -97,6 +97,10 @@ class ParameterTraining:
         InvalidArgumentError: If model, cost or V is not finite at theta_0 on the data.
     """
 
+    config: ParameterConfig
+    attempt: int
+    step: int
+
     def __init__(
         self,
         mpc: MPC,
@@ -136,7 +140,7 @@ class ParameterTraining:
         self._data, self._batches, self._reduction = source
         self._shards = shards
         self._n_gradients = config.n_steps if "model" in groups else 0
-        self.n_steps = self._n_gradients + 1
+        self.n_steps: int = self._n_gradients + 1
         self.attempt = self.step = 0
         self._begin()
 

@@ -135,6 +135,9 @@ class LearnValue(Stage):
         config: How.
     """
 
+    phase: str
+    epoch: int
+
     phase, epoch = "(VALUE) learning V", 500
 
     def __init__(self, config: ValueConfig) -> None:
@@ -166,7 +169,7 @@ class LearnParameters(Stage):
 
     def begin(self, known: Known) -> Training:
         """See :class:`~mpcoffline.learning.bellman.regression.ParameterTraining`."""
-        self.phase = f"(FIT) learning {'+'.join(known.groups)}"
+        self.phase: str = f"(FIT) learning {'+'.join(known.groups)}"
         mpc = known.mpc if known.cost is not None else in_units_of(known.mpc, known.table)
         value, config, seen = known.constant_value, self._adapting(known), known
         if known.cost is None and ends_matter(known.table, mpc.discount):  # of which T knows; no cost explains them

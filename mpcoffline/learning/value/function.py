@@ -37,6 +37,10 @@ class ValueFunction(nn.Module):
         n_members: Number of networks; their mean is the function.
     """
 
+    ny: int
+    hidden: tuple[int, ...]
+    n_members: int
+
     mean: Tensor
     std: Tensor
     offset: Tensor
@@ -146,7 +150,7 @@ class Mean(nn.Module):
 
     def __init__(self, members: Sequence[nn.Module]) -> None:
         super().__init__()
-        self.members = nn.ModuleList(members)
+        self.members: nn.ModuleList = nn.ModuleList(members)
 
     def forward(self, x: Tensor) -> Tensor:
         """The mean of ``member(x)``."""

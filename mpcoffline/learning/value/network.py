@@ -36,8 +36,8 @@ class FlatNetwork:
     """
 
     def __init__(self, widths: Sequence[int]) -> None:
-        self.n_in = widths[0]
-        self.shapes = list(pairwise(widths))
+        self.n_in: int = widths[0]
+        self.shapes: list[tuple[int, int]] = list(pairwise(widths))
 
     @classmethod
     def like(cls, net: nn.Sequential) -> FlatNetwork:
@@ -111,6 +111,10 @@ class FlatCritic:
         bounds: Between which all outputs are held.
     """
 
+    networks: list[FlatNetwork]
+    weights: list[Tensor]
+    bounds: tuple[float, float] | None
+
     def __init__(
         self,
         networks: Sequence[FlatNetwork],
@@ -147,8 +151,8 @@ class Member:
     ) -> None:
         networks = [FlatNetwork.like(net) for net in nets]
         start = [network.weights_of(net).to(device) for network, net in zip(networks, nets, strict=True)]
-        self.critic = FlatCritic(networks, [weights.clone().requires_grad_() for weights in start])
-        self.target = FlatCritic(networks, start, bounds)
+        self.critic: FlatCritic = FlatCritic(networks, [weights.clone().requires_grad_() for weights in start])
+        self.target: FlatCritic = FlatCritic(networks, start, bounds)
         self._optimiser, self._reduction = Adam(self.critic.weights, fused=True), reduction
 
     def descend(self, method: ValueMethod, parts: Parts, discount: float, learning_rate: float, polyak: float) -> float:

@@ -62,6 +62,10 @@ class ValueTraining:
         stochasticity: What ``"auto"`` found in the data; None where the method was given.
     """
 
+    step: int
+    n_steps: int
+    stochasticity: Stochasticity | None
+
     def __init__(
         self,
         table: TransitionTable,
@@ -78,7 +82,7 @@ class ValueTraining:
         self.step, self.n_steps = 0, config.n_steps
         self._config, self._discount, self._device = config, discount, device
         self.stochasticity = estimate_stochasticity(table, seed=seed) if config.method == "auto" else None
-        self.method = config.build(noisy=self.stochasticity is not None and self.stochasticity.is_noisy)
+        self.method: ValueMethod = config.build(noisy=self.stochasticity is not None and self.stochasticity.is_noisy)
         _tell(self.method, self.stochasticity, config, discount)
         table, held_out = split_episodes(table, config.validation, seed)
         with torch.random.fork_rng():

@@ -51,7 +51,7 @@ class Units:
             self._shift[-1 - table.ny : -1] *= 1.0 - self._increments  # the difference of two states has none
             self._shift -= torch.from_numpy(table.centring.centre).to(device)
         low, high = value_bounds(statistics, discount)
-        self.bounds = float((low - offset) / scale), float((high - offset) / scale)
+        self.bounds: tuple[float, float] = float((low - offset) / scale), float((high - offset) / scale)
 
     def columns(self, rows: Tensor) -> Columns:
         """The columns of packed rows ``(B, 2 ny + nu + 2)`` of the table, float32."""

@@ -60,7 +60,7 @@ class LayeredCode:
 
     def __init__(self, structure: Layered, nx: int, nu: int, theta: ca.SX) -> None:
         self._tables: dict[tuple[str, str], str] = {}  # by type and content: the name
-        self.n_scalars = structure.n_scalars
+        self.n_scalars: int = structure.n_scalars
         self._steps, self._outputs, self._nodes = structure.steps, structure.outputs, structure.nodes
         self._theta = theta
         self._states = dict(_states(structure, nx))

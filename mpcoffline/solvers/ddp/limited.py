@@ -26,6 +26,9 @@ class Limited:
         mpc: A problem that has limits.
     """
 
+    labels: tuple[str, ...]
+    horizon: int
+
     def __init__(self, mpc: MPC) -> None:
         symbols = (ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", mpc.nu), ("theta", mpc.space.size)))
         limits = limits_of(mpc, *symbols)

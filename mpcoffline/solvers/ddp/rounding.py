@@ -47,7 +47,7 @@ class Rounding:
     def __init__(self, mpc: MPC, make: Callable[[MPC], _Kernel]) -> None:
         self._mpc = mpc
         problems = [rounded_mpc(mpc, share) for share in SHARES]
-        self.corners = problems[0][1]
+        self.corners: list[Corner] = problems[0][1]
         self._solvers = [make(rounded) for rounded, _ in problems] if self.corners else []
         self._told = False
 

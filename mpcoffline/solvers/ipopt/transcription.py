@@ -69,6 +69,9 @@ class Transcription:
         labels: The name of each hard constraint and state bound in :meth:`violations`, and its stage.
     """
 
+    mpc: MPC
+    stagewise: bool
+
     def __init__(self, mpc: MPC, stagewise: bool = False) -> None:
         self.mpc, self.stagewise = mpc, stagewise
         n, size = mpc.horizon, mpc.space.size
@@ -77,25 +80,25 @@ class Transcription:
         self._theta = ca.SX.sym("theta", size, n + 1 if stagewise else 1)
         self._inputs = [ca.SX.sym(f"u{k}", mpc.nu) for k in range(n)]
         self._states = [self._state, *(ca.SX.sym(f"x{k + 1}", mpc.nx) for k in range(n))]
-        self.parameters = ca.vertcat(self._state, ca.vec(self._theta))
+        self.parameters: ca.SX = ca.vertcat(self._state, ca.vec(self._theta))
         self.labels: list[tuple[str, int]] = []
         hard: list[ca.SX] = []
         soft: list[tuple[ca.SX, Penalty, int]] = []
         self._collect(hard, soft)
         self._hard = hard
-        self.soft = ca.vertcat(*(h for h, _, _ in soft)) if soft else ca.SX(0, 1)
+        self.soft: ca.SX = ca.vertcat(*(h for h, _, _ in soft)) if soft else ca.SX(0, 1)
         slacks = ca.SX.sym("slack", self.soft.numel())
         # The square alone keeps a slack from being negative, and has no kink for which a bound would be needed.
         low = [np.full(h.numel(), 0.0 if penalty.l1 else -np.inf) for h, penalty, _ in soft]
         self._slack_low = np.concatenate([*low, np.zeros(0)])
-        self.variables = ca.vertcat(
+        self.variables: ca.SX = ca.vertcat(
             *(v for pair in zip(self._inputs, self._states[1:], strict=True) for v in pair), slacks
         )
-        self.cost = self._objective() + _price(soft, slacks, mpc.discount)
+        self.cost: ca.SX = self._objective() + _price(soft, slacks, mpc.discount)
         self._true_cost = self._objective() + _price(soft, ca.fmax(self.soft, 0.0), mpc.discount)
-        self.constraints = ca.vertcat(*self._defects(), *hard, self.soft - slacks)
+        self.constraints: ca.SX = ca.vertcat(*self._defects(), *hard, self.soft - slacks)
         n_defects = n * mpc.nx
-        self.constraint_low = np.full(self.constraints.numel(), -np.inf)
+        self.constraint_low: Array = np.full(self.constraints.numel(), -np.inf)
         self.constraint_low[:n_defects] = 0.0
 
     def theta_at(self, k: int) -> ca.SX:

@@ -82,7 +82,7 @@ def test_reading_without_objects_is_minaris_reading(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(
-    "layout", ["contiguous", "compressed", "float16", "chunks across", "version 3", "many members"]
+    "layout", ["contiguous", "compressed", "float16", "big-endian", "chunks across", "version 3", "many members"]
 )
 def test_other_layouts_of_the_file(tmp_path: Path, layout: str) -> None:
     rng = np.random.default_rng(1)
@@ -91,6 +91,7 @@ def test_other_layouts_of_the_file(tmp_path: Path, layout: str) -> None:
         "contiguous": {},
         "compressed": {"compression": "gzip", "chunks": True},
         "float16": {"chunks": (31, NY), "dtype": np.float16},
+        "big-endian": {"chunks": (31, NY), "dtype": ">f4"},
         "chunks across": {"chunks": (7, 1)},
         "version 3": {"chunks": (31, NY)},
         "many members": {"chunks": (8, NY)},
