@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Trains one algorithm of d3rlpy on transitions that were handed over, and writes its policy as TorchScript.
 
-    ENV/bin/python scripts/field_peers/d3rlpy_peer.py data.npz policy.pt '{"algorithm": "iql", "seed": 0, "steps": 20000}'
+    ENV/bin/python d3rlpy_peer.py data.npz policy.pt '{"algorithm": "iql", "seed": 0, "steps": 20000}'
 
 Runs in an environment of its own that scripts/bench_field makes, without the project; mpcoffline.studies.field.peers
 says what the data hold. The last line it prints is JSON: the CPU seconds of the training.

@@ -23,9 +23,10 @@ from mpcoffline.studies.zoo import Found, noted, short_text
 
 from .arenas import Arena, arena_of
 from .jobs import ALGORITHMS, NAN, SEARCHED, Job, Outcome
-from .peers import PeerError, Peers, settings_to_try, train
+from .peers import PeerError, Peers, settings_to_try, time_mpcrl, train
 
 _TIMED = 100  # actions that are timed
+_TRANSITIONS = 20  # that mpcrl is timed on
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,10 @@ def _fill(found: Found, job: Job, peers: Peers | None) -> None:
     table = arena.log(job.size or 1, job.seed)
     if job.size:
         found["rows"] = len(table)
+    if job.algorithm == "mpcrl":
+        found["train_s"] = time_mpcrl(known(peers, job), arena.rough(job.seed), table, _TRANSITIONS) * len(table)
+        found["said"] = f"from {min(_TRANSITIONS, len(table)) / len(table):.2%} of the log"
+        return
     made = _MAKERS[SEARCHED.get(job.algorithm, job.algorithm)](arena, job, table, peers)
     if made is None:
         found["said"] = "none is known"
@@ -76,6 +81,17 @@ def _fill(found: Found, job: Job, peers: Peers | None) -> None:
     found.update(train_s=made.train_s, file_kb=made.file_kb, verdict=made.verdict, said=short_text(made.said))
     found["latency_ms"] = latency_ms(made.policy, table)
     _put(found, arena.loops(made.policy, job.seed, job.starts))
+
+
+def known(peers: Peers | None, job: Job) -> Peers:
+    """Where other packages live.
+
+    Raises:
+        PeerError: If that was not said.
+    """
+    if peers is None:
+        raise PeerError(job.algorithm, expected="an environment of the peers", actual="none")
+    return peers
 
 
 def _put(found: Found, loops: Loops) -> None:
@@ -144,8 +160,7 @@ def _ours(arena: Arena, job: Job, table: TransitionTable, peers: Peers | None) -
 
 def _peer(arena: Arena, job: Job, table: TransitionTable, peers: Peers | None) -> Made:
     """Another package's algorithm; where it is searched, the best of its settings by closed loops on the plant."""
-    if peers is None:
-        raise PeerError(job.algorithm, expected="an environment of the peers", actual="none")
+    peers = known(peers, job)
     algorithm, bounds = SEARCHED.get(job.algorithm, job.algorithm), arena.bounds(table)
     log = f"{job.arena} {job.size} {job.seed}"
     options: list[dict[str, float]] = settings_to_try(algorithm) if job.algorithm in SEARCHED else [{}]

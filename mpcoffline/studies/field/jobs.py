@@ -15,7 +15,7 @@ class Algorithm(NamedTuple):
     Attributes:
         label: What it is called on the page.
         needs_log: Whether it depends on the log; those that do not are done once a seed.
-        peer: Whether another package trains it, in steps.
+        peer: Whether d3rlpy trains it, in steps.
         cost: How long it takes beside the others, roughly: what is quick is done first.
         largest: The largest log that it is given by default; 0 for any.
     """
@@ -39,6 +39,8 @@ ALGORITHMS: dict[str, Algorithm] = {
     "td3+bc": Algorithm("TD3+BC", peer=True, cost=2),
     "iql": Algorithm("IQL", peer=True, cost=2, largest=5_000),
     "cql": Algorithm("CQL", peer=True, cost=3, largest=5_000),
+    # Only its time is measured: what a pass over the log takes where each transition solves two MPCs.
+    "mpcrl": Algorithm("mpcrl, LSTD-Q", cost=1, largest=1_000),
 }
 #: With ``--search``: the same with the best of ten settings by closed loops on the plant, which no log gives.
 SEARCHED = {f"{name}, searched": name for name in ("td3+bc", "iql", "cql")}
@@ -102,7 +104,8 @@ class Outcome:
         latency_ms: Median time of an action, one observation at a time.
         file_kb: Size of the saved controller.
         verdict: What ``diagnose`` says of ours.
-        said: What else is to be known: the candidate that was handed out, the settings that a search took.
+        said: What else is to be known: the candidate that was handed out, the settings that a search took, the share
+            of the log that was timed.
         error: What went wrong; such a job is tried again.
     """
 

@@ -21,6 +21,7 @@ from mpcoffline.core.executors.protocol import THREAD_VARIABLES
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.interop.convert import to_dict
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC
 
 #: What a search tries: the two main knobs of each, their authors' settings among the values.
 KNOBS: dict[str, dict[str, tuple[float, ...]]] = {
@@ -39,14 +40,17 @@ class Peers:
     """Where other packages live.
 
     Attributes:
-        python: The interpreter of their environment.
-        script: What trains there, ``script data.npz policy.pt JOB``.
-        folder: Where trained policies are kept, so that what was interrupted goes on after the last whole training.
+        home: Holds an environment a package, ``env-d3rlpy`` and ``env-mpcrl``, and ``trained``, the trained policies,
+            so that what was interrupted goes on after the last whole training.
+        scripts: Holds what runs there, ``d3rlpy_peer.py`` and ``mpcrl_peer.py``: ``script data.npz output JOB``.
     """
 
-    python: Path
-    script: Path
-    folder: Path
+    home: Path
+    scripts: Path
+
+    def python(self, package: str) -> Path:
+        """The interpreter of a package's environment."""
+        return self.home / f"env-{package}" / "bin" / "python"
 
 
 @dataclass(frozen=True)
@@ -138,28 +142,56 @@ def train(
     job = {"algorithm": algorithm, "seed": seed, "steps": steps, "options": dict(options or {})}
     text = json.dumps([name, len(table), job], sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-    peers.folder.mkdir(parents=True, exist_ok=True)
-    policy, said = (peers.folder / f"{digest}.{ending}" for ending in ("pt", "json"))
+    folder = peers.home / "trained"
+    folder.mkdir(parents=True, exist_ok=True)
+    policy, said = (folder / f"{digest}.{ending}" for ending in ("pt", "json"))
     if not said.exists():
-        told = _run(peers, handed_over(table, *bounds), policy, job)
+        told = _run(peers, "d3rlpy", handed_over(table, *bounds), policy, job)
         said.write_text(json.dumps({"what": text, **told}), encoding="utf-8")  # last: without it there is no training
     told = json.loads(said.read_text(encoding="utf-8"))
     return Trained(TorchScriptPolicy(policy, *bounds), told["train_s"], policy.stat().st_size / 1e3)
 
 
-def _run(peers: Peers, data: dict[str, NDArray[Any]], policy: Path, job: dict[str, Any]) -> dict[str, Any]:
-    if not peers.python.exists():
-        expected, hint = "a Python environment with the peers", "scripts/bench_field makes it."
-        raise PeerError(str(peers.python), expected=expected, actual="none", hint=hint)
+def time_mpcrl(peers: Peers, mpc: MPC, table: TransitionTable, transitions: int) -> float:
+    """CPU seconds a transition that LSTD-Q learning of mpcrl takes with an MPC, on the first rows of a log.
+
+    Two MPCs are solved a transition, Q(s, a) and V(s+), by ipopt, and Q is differentiated.
+
+    Args:
+        peers: Where mpcrl lives.
+        mpc: The MPC, whose whole theta is learned.
+        table: The log.
+        transitions: How many are timed.
+
+    Raises:
+        PeerError: As :func:`train`; also where less than half of them could be solved.
+    """
+    rows = table.take(slice(transitions)).values()
+    functions = {"dynamics": mpc.dynamics_function, "stage": mpc.stage_function, "terminal": mpc.terminal_function}
+    data: dict[str, Any] = {name: function.serialize() for name, function in functions.items()}
+    data |= {"theta": mpc.theta, "horizon": mpc.horizon, "discount": mpc.discount}
+    data |= {"low": mpc.action_low, "high": mpc.action_high, "actions": rows.actions, "costs": rows.costs}
+    data |= {"states": mpc.state(rows.observations), "next_states": mpc.state(rows.next_observations)}
+    told = _run(peers, "mpcrl", data, peers.home / "none", {"algorithm": "mpcrl", "transitions": transitions})
+    if told["solved"] < 0.5 * told["transitions"]:
+        raise PeerError("mpcrl", expected="most MPCs to be solved", actual=f"{told['solved']} of {told['transitions']}")
+    return float(told["train_s"] / told["transitions"])
+
+
+def _run(peers: Peers, package: str, data: dict[str, Any], output: Path, job: dict[str, Any]) -> dict[str, Any]:
+    python, script = peers.python(package), peers.scripts / f"{package}_peer.py"
+    if not python.exists():
+        expected, hint = f"a Python environment with {package}", "scripts/bench_field makes it."
+        raise PeerError(str(python), expected=expected, actual="none", hint=hint)
     environment = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "data.npz"
-        np.savez(file, **data)  # type: ignore[arg-type]
-        command = [str(peers.python), str(peers.script), str(file), str(policy), json.dumps(job)]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder, check=False)  # noqa: S603
+        np.savez(file, **data)
+        command = [str(python), str(script), str(file), str(output), json.dumps(job)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder, check=False)
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise PeerError(job["algorithm"], expected="a training that ends well", actual=lines[-1])
+        raise PeerError(job["algorithm"], expected="a run that ends well", actual=lines[-1])
     told: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return told
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from mpcoffline import TransitionTable
-from mpcoffline.studies.field.peers import KNOBS, PeerError, Peers, handed_over, settings_to_try, train
+from mpcoffline import MPC, Model, QuadraticCost, TransitionTable
+from mpcoffline.studies.field.peers import KNOBS, PeerError, Peers, handed_over, settings_to_try, time_mpcrl, train
 
 ROOT = Path(__file__).parents[3]
 LOW, HIGH = np.array([-2.0]), np.array([4.0])
@@ -89,8 +89,13 @@ shutil.copy({str(tmp_path / "thrice.pt")!r}, sys.argv[2])
 print("some words")
 print(json.dumps({{"train_s": job["steps"] / 10, "options": job["options"]}}))
 """
-    (tmp_path / "program.py").write_text(program)
-    return Peers(Path(sys.executable), tmp_path / "program.py", tmp_path / "trained")
+    for package in ("d3rlpy", "mpcrl"):
+        python = tmp_path / f"env-{package}" / "bin" / "python"
+        python.parent.mkdir(parents=True)
+        python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
+        python.chmod(0o755)
+    (tmp_path / "d3rlpy_peer.py").write_text(program)
+    return Peers(tmp_path, tmp_path)
 
 
 def test_a_training_is_done_once(log: TransitionTable, peers: Peers) -> None:
@@ -102,7 +107,7 @@ def test_a_training_is_done_once(log: TransitionTable, peers: Peers) -> None:
     np.testing.assert_allclose(actions, [[1.5], [-2.0], [4.0]])  # within bounds
     assert state is None
     np.testing.assert_allclose(trained.policy.predict(np.array([0.5, 9.0]))[0], [1.5])
-    peers.script.write_text("raise SystemExit(1)")
+    (peers.scripts / "d3rlpy_peer.py").write_text("raise SystemExit(1)")
     assert train(peers, "log", log, (LOW, HIGH), **job).train_s == 5.0  # it is there
     for change in ({"seed": 1}, {"steps": 51}, {"options": {"alpha": 1.0}}, {"algorithm": "iql"}):
         with pytest.raises(PeerError, match="exit code 1"):
@@ -112,8 +117,32 @@ def test_a_training_is_done_once(log: TransitionTable, peers: Peers) -> None:
 
 
 def test_what_fails_there_is_told_here(log: TransitionTable, peers: Peers) -> None:
-    with pytest.raises(PeerError, match="bc: expected a training that ends well, got no luck"):
+    with pytest.raises(PeerError, match="bc: expected a run that ends well, got no luck"):
         train(peers, "log", log, (LOW, HIGH), algorithm="bc", seed=13, steps=1)
-    nowhere = Peers(peers.folder / "bin" / "python", peers.script, peers.folder)
+    nowhere = Peers(peers.home / "nothing", peers.scripts)
     with pytest.raises(PeerError, match="scripts/bench_field makes it"):
         train(nowhere, "log", log, (LOW, HIGH), algorithm="bc", seed=0, steps=1)
+
+
+MASS = """
+import json, sys
+import casadi as ca, numpy as np
+data = np.load(sys.argv[1])
+x, u, theta = data["states"][0], data["actions"][0], data["theta"]
+f, l, T = (ca.Function.deserialize(str(data[name])) for name in ("dynamics", "stage", "terminal"))
+# One step of x+ = 0.9 x + b u from x = 2 under u = -1, with b = 0.5; costs x^2 + 3 u^2 and 4 x^2.
+told = [f(x, u, theta), l(x, u, theta), T(x, theta), data["next_states"][0], data["costs"][0], data["horizon"]]
+right = np.allclose([float(np.ravel(each)[0]) for each in told], [1.3, 7.0, 16.0, 1.2, 6.5, 9.0])
+print(json.dumps({"train_s": 0.3, "transitions": len(data["states"]), "solved": 3 * right}))
+"""
+
+
+def test_mpcrl_is_handed_the_same_mpc(peers: Peers) -> None:
+    model = Model(lambda x, u, p: 0.9 * x + p["b"] * u, nx=1, nu=1, dt=1.0, discrete=True, parameters={"b": 0.5})
+    cost, end = QuadraticCost(W=[[1.0]], R=[[3.0]]), QuadraticCost(W=[[4.0]])
+    mpc = MPC(model, cost, end, horizon=9, discount=0.9, action_low=[-1], action_high=[1])
+    table = TransitionTable.from_arrays([[2.0]] * 7, [[-1.0]] * 7, [6.5] * 7, [[1.2]] * 7, [0] * 7)
+    (peers.scripts / "mpcrl_peer.py").write_text(MASS)
+    assert time_mpcrl(peers, mpc, table, 3) == pytest.approx(0.1)
+    with pytest.raises(PeerError, match="expected most MPCs to be solved, got 3 of 7"):
+        time_mpcrl(peers, mpc, table, 100)
