@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 
 from mpcoffline.control.evaluation import Predictor, evaluate
 from mpcoffline.control.policy import MPCPolicy
@@ -175,7 +176,7 @@ class PlantArena:
     def bounds(self, table: TransitionTable) -> tuple[Array, Array]:
         """Those of MPC_1."""
         mpc = self.rough(0)
-        return _finite(np.asarray(mpc.action_low), np.asarray(mpc.action_high), table)
+        return _finite(mpc.action_low, mpc.action_high, table)
 
     def behaviour(self, seed: int, n_starts: int) -> Behaviour:
         """Other controllers of the same kind, from the starts of the comparison."""
@@ -186,10 +187,10 @@ class PlantArena:
         return self._plant.closed_loops(policy, seed + _TRIED * tried, n_starts)
 
 
-def _finite(low: Array, high: Array, table: TransitionTable) -> tuple[Array, Array]:
+def _finite(low: ArrayLike, high: ArrayLike, table: TransitionTable) -> tuple[Array, Array]:
     actions = np.asarray(table.values().actions, np.float64)
-    low, high = (np.broadcast_to(np.asarray(each, np.float64).ravel(), actions.shape[1:]) for each in (low, high))
+    least, most = (np.broadcast_to(np.asarray(each, np.float64).ravel(), actions.shape[1:]) for each in (low, high))
     return (
-        np.where(np.isfinite(low), low, actions.min(axis=0)),
-        np.where(np.isfinite(high), high, actions.max(axis=0)),
+        np.where(np.isfinite(least), least, actions.min(axis=0)),
+        np.where(np.isfinite(most), most, actions.max(axis=0)),
     )

@@ -31,10 +31,10 @@ class Algorithm(NamedTuple):
 ALGORITHMS: dict[str, Algorithm] = {
     "truth": Algorithm("MPC, true model", needs_log=False),
     "behaviour": Algorithm("the log's controller", needs_log=False),
-    "rough": Algorithm("MPC_1 (rough model)", needs_log=False),
-    "identified": Algorithm("identified model, nominal MPC"),
-    "default": Algorithm("mpcoffline, `default`"),
-    "paper": Algorithm("mpcoffline, `paper`"),
+    "rough": Algorithm("MPC_1, rough model", needs_log=False),
+    "identified": Algorithm("identified, plain MPC"),
+    "default": Algorithm("mpcoffline, default"),
+    "paper": Algorithm("mpcoffline, paper"),
     "bc": Algorithm("behaviour cloning", peer=True, cost=1),
     "td3+bc": Algorithm("TD3+BC", peer=True, cost=2),
     "iql": Algorithm("IQL", peer=True, cost=2, largest=5_000),
@@ -127,6 +127,11 @@ class Outcome:
     verdict: str = ""
     said: str = ""
     error: str = ""
+
+    @property
+    def has_own_starts(self) -> bool:
+        """Whether these are logged episodes, which began elsewhere than the others'."""
+        return self.algorithm == "behaviour" and bool(self.said)
 
     @property
     def key(self) -> tuple[str, str, int, int, int, int]:

@@ -84,7 +84,7 @@ def drawn(results: Results, tone: str) -> Figure:
     """A panel a plant; make it inside :func:`themed`."""
     arenas = [arena for arena in results.arenas if results.sizes(arena)]
     n_rows = -(-len(arenas) // _COLUMNS)
-    figure = new_figure(PAGE_WIDTH, 0.75 + 2.05 * n_rows)
+    figure = new_figure(PAGE_WIDTH, 0.9 + 2.05 * n_rows)
     panels = np.atleast_1d(figure.subplots(n_rows, min(_COLUMNS, len(arenas)), squeeze=False)).ravel()
     for axes, arena in zip(panels, arenas, strict=False):
         _panel(axes, results, arena, tone)
@@ -96,7 +96,7 @@ def drawn(results: Results, tone: str) -> Figure:
     for axes in panels[max(0, len(arenas) - columns) : len(arenas)]:
         axes.set_xlabel("transitions in the log")
     handles, labels = _legend(results, tone)
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, handlelength=2.6, columnspacing=1.4)
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, handlelength=2.6, columnspacing=1.4)
     return figure
 
 
@@ -107,7 +107,7 @@ def _panel(axes: Axes, results: Results, arena: str, tone: str) -> None:
     axes.axhline(1.0, color=ink, linewidth=0.8)
     for name, (dashes, _) in LEVELS.items():
         cell = results.cell(arena, name, 0)
-        if cell is not None and cell.excess <= top:
+        if cell is not None and cell.excess <= top:  # NaN is not
             axes.axhline(cell.excess, color=ink, linewidth=0.8, linestyle=dashes, alpha=0.7)
     for k, (name, look) in enumerate(LOOKS.items()):
         shift = 1.0 + 0.05 * (k - 3)  # so that equal costs stay apart
@@ -152,11 +152,11 @@ def _legend(results: Results, tone: str) -> tuple[list[Any], list[str]]:
             width = 1.9 if name == OURS else 1.2
             style: dict[str, Any] = {"color": getattr(look, tone), "linestyle": look.dashes, "marker": look.marker}
             handles.append(Line2D([], [], linewidth=width, markersize=5, **style))
-            labels.append(ALGORITHMS[name].label.replace("`", ""))
+            labels.append(ALGORITHMS[name].label)
     handles.append(Line2D([], [], color=ink, linewidth=0.8))
     labels.append("MPC, true model")
     for name, (dashes, label) in LEVELS.items():
-        if name in there:
+        if any(o.algorithm == name and not o.has_own_starts for o in results.done):
             handles.append(Line2D([], [], color=ink, linewidth=0.8, linestyle=dashes, alpha=0.7))
             labels.append(label)
     return handles, labels

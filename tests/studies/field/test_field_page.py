@@ -45,7 +45,7 @@ def test_excess_knows_no_sign(results: list[Outcome]) -> None:
 
 def test_the_page_says_what_is_there_and_leaves_the_rest_blank(results: list[Outcome]) -> None:
     text = page.report(results)
-    assert "| 1,000 | mpcoffline, `default` | 16 +- 1 |" in text.replace("\\", "")
+    assert "| 1,000 | mpcoffline, default | 16 +- 1 |" in text.replace("\\", "")
     assert "1 recommend; 1 keep MPC" in text.replace("\\", "")
     assert "| 5,000 | behaviour cloning | 10 +- 0.5 |" in text
     blank = [line for line in text.splitlines() if line.startswith("| 5,000 | IQL |")]
