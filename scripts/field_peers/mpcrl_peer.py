@@ -60,6 +60,11 @@ def program(data: dict[str, np.ndarray]) -> Any:
     return mpc
 
 
+def held(state: np.ndarray, action: np.ndarray, horizon: int) -> dict[str, np.ndarray]:
+    """The plan that a solve begins at: all as it is now. From zeros, a reference there stops ipopt at once."""
+    return {"x": np.tile(state[:, None], (1, horizon + 1)), "u": np.tile(action[:, None], (1, horizon))}
+
+
 def main() -> None:
     from mpcrl import ExperienceReplay, LearnableParameter, LearnableParametersDict, LstdQLearningAgent
     from mpcrl.optim import NewtonMethod
@@ -82,10 +87,10 @@ def main() -> None:
     columns = (data[name][:n] for name in ("states", "actions", "costs", "next_states"))
     rollout = list(zip(*columns, strict=True))
     start = time.process_time()
-    for transition in rollout:
-        solved_q = agent.action_value(*transition[:2])
-        _, solved_v = agent.state_value(transition[3], False)
-        agent._try_store_experience(float(transition[2]), solved_q, solved_v)
+    for state, action, cost, state_next in rollout:
+        solved_q = agent.action_value(state, action, vals0=held(state, action, int(data["horizon"])))
+        _, solved_v = agent.state_value(state_next, False, vals0=held(state_next, action, int(data["horizon"])))
+        agent._try_store_experience(float(cost), solved_q, solved_v)
     seconds = time.process_time() - start
     print(json.dumps({"train_s": seconds, "transitions": n, "solved": len(agent.experience)}))
 

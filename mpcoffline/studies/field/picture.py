@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mpcoffline.plotting.style import PAGE_WIDTH, new_figure, paper_style
+from mpcoffline.plotting.style import PAGE_WIDTH, paper_style
 
 from .jobs import ALGORITHMS, Outcome
 from .page import OURS, Results
@@ -82,9 +82,13 @@ def themed(tone: str) -> Iterator[None]:
 
 def drawn(results: Results, tone: str) -> Figure:
     """A panel a plant; make it inside :func:`themed`."""
+    from matplotlib.figure import Figure
+
     arenas = [arena for arena in results.arenas if results.sizes(arena)]
     n_rows = -(-len(arenas) // _COLUMNS)
-    figure = new_figure(PAGE_WIDTH, 0.9 + 2.05 * n_rows)
+    height = 1.05 + 2.15 * n_rows
+    figure = Figure(figsize=(PAGE_WIDTH, height))
+    figure.subplots_adjust(0.09, 0.45 / height, 0.985, 1.0 - 0.85 / height, wspace=0.24, hspace=0.34)
     panels = np.atleast_1d(figure.subplots(n_rows, min(_COLUMNS, len(arenas)), squeeze=False)).ravel()
     for axes, arena in zip(panels, arenas, strict=False):
         _panel(axes, results, arena, tone)
@@ -96,7 +100,7 @@ def drawn(results: Results, tone: str) -> Figure:
     for axes in panels[max(0, len(arenas) - columns) : len(arenas)]:
         axes.set_xlabel("transitions in the log")
     handles, labels = _legend(results, tone)
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, handlelength=2.6, columnspacing=1.4)
+    figure.legend(handles, labels, loc="upper center", ncols=4, handlelength=2.4, columnspacing=1.2, fontsize=7.5)
     return figure
 
 
@@ -110,7 +114,7 @@ def _panel(axes: Axes, results: Results, arena: str, tone: str) -> None:
         if cell is not None and cell.excess <= top:  # NaN is not
             axes.axhline(cell.excess, color=ink, linewidth=0.8, linestyle=dashes, alpha=0.7)
     for k, (name, look) in enumerate(LOOKS.items()):
-        shift = 1.0 + 0.05 * (k - 3)  # so that equal costs stay apart
+        shift = 1.04 ** (k - 3)  # so that equal costs stay apart
         cells = [(size, cell) for size in sizes if (cell := results.cell(arena, name, size)) is not None]
         if not cells:
             continue
@@ -126,7 +130,7 @@ def _panel(axes: Axes, results: Results, arena: str, tone: str) -> None:
             if (o.arena, o.algorithm) == (arena, name) and (each := results.excess(o)) < top:
                 axes.plot(shift * o.size, each, ".", color=color, markersize=3, alpha=0.6)
     axes.set_xscale("log")
-    axes.set_xlim(0.7 * min(sizes), 1.45 * max(sizes))
+    axes.set_xlim(0.6 * min(sizes), 1.7 * max(sizes))
     axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
     axes.minorticks_off()
     axes.set_ylim(top=top)
