@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import importlib.util
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.control.evaluation import Predictor
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.errors import InvalidDataError, MPCOfflineError, StorageError
 from mpcoffline.core.types import Array
@@ -79,15 +81,24 @@ class PlantFile:
             raise kind(path.stem, expected="a plant that can be loaded and reset", actual=actual) from error
         return cls(path.stem, module)
 
-    def log(self, seed: int) -> TransitionTable:
-        """The log that the plant's own controllers make, another controller each episode; or some of its data set."""
+    def log(self, seed: int, size: int | None = None) -> TransitionTable:
+        """The log that the plant's own controllers make, another controller each episode; or some of its data set.
+
+        Args:
+            seed: Of the episodes.
+            size: The fewest episodes that hold so many transitions, all of a smaller data set; ``N_EPISODES`` by
+                default.
+        """
         if (dataset := getattr(self.module, "DATASET", None)) is not None:
             table = TransitionTable.of(load_dataset(dataset))
             rng, (_, firsts, lengths) = np.random.default_rng([_LOG, seed]), table.episodes
-            some = rng.permutation(len(firsts))[: self.module.N_EPISODES]
-            return table.take(np.concatenate([np.arange(firsts[e], firsts[e] + lengths[e]) for e in np.sort(some)]))
-        rngs = [np.random.default_rng([_LOG, seed, episode]) for episode in range(self.module.N_EPISODES)]
-        return self._recorded(rngs, self.module.behaviour)
+            order = rng.permutation(len(firsts))
+            enough = None if size is None else int(np.searchsorted(np.cumsum(lengths[order]), size)) + 1
+            some = np.sort(order[: self.module.N_EPISODES if enough is None else enough])
+            return table.take(np.concatenate([np.arange(firsts[e], firsts[e] + lengths[e]) for e in some]))
+        episodes = range(self.module.N_EPISODES) if size is None else count()
+        rngs = (np.random.default_rng([_LOG, seed, episode]) for episode in episodes)
+        return self._recorded(rngs, self.module.behaviour, size)
 
     def trial(self, policy: MPCPolicy, seed: int, n_episodes: int) -> TransitionTable:
         """The log of a trial of a policy, from starts that neither the log nor the closed loops hold."""
@@ -104,9 +115,12 @@ class PlantFile:
         return self._recorded([np.random.default_rng([_TRIAL, seed, e]) for e in range(n_episodes)], controller)
 
     def _recorded(
-        self, rngs: Sequence[np.random.Generator], controller: Callable[[np.random.Generator], Any]
+        self,
+        rngs: Iterable[np.random.Generator],
+        controller: Callable[[np.random.Generator], Any],
+        size: int | None = None,
     ) -> TransitionTable:
-        """Episodes, each with draws and a controller of its own."""
+        """Episodes, each with draws and a controller of its own, until there are ``size`` transitions."""
         rows: dict[str, list[Any]] = {name: [] for name in ("s", "a", "cost", "s_next", "end", "episode")}
         for episode, rng in enumerate(rngs):
             plant, observation = self._started(rng)
@@ -119,10 +133,12 @@ class PlantFile:
                     column.append(value)
                 if ended:
                     break
+            if size is not None and len(rows["s"]) >= size:
+                break
         s, a, cost_, s_next, end, ids = map(np.array, rows.values())
         return TransitionTable.from_arrays(s, a, cost_, s_next, end, ids)
 
-    def closed_loops(self, controller: MPCPolicy | None, seed: int, n_starts: int, *, logged: bool = False) -> Loops:
+    def closed_loops(self, controller: Predictor | None, seed: int, n_starts: int, *, logged: bool = False) -> Loops:
         """Episodes from starts that the log does not hold: the same starts for each controller of a seed.
 
         The plants move one after the other, the MPCs of all episodes that still run are solved in one batch.
@@ -140,7 +156,7 @@ class PlantFile:
         plants, observations = [plant for plant, _ in started], [observation for _, observation in started]
         act = self._behaviours(seed, n_starts) if controller is None else _Batched(controller)
         cost, running = np.zeros(n_starts), np.arange(n_starts)
-        over, steps = np.zeros(n_starts), np.zeros(n_starts)
+        over, steps, discounted = np.zeros(n_starts), np.zeros(n_starts), np.zeros(n_starts)
         for k in range(self.module.STEPS):
             actions = act(np.stack([observations[e] for e in running]), running, k)
             goes_on = np.ones(len(running), dtype=bool)
@@ -148,11 +164,13 @@ class PlantFile:
                 reached, stage_cost, ended = plants[e].step(np.asarray(actions[i], np.float64))
                 observations[e], goes_on[i] = np.asarray(reached, np.float64), not ended
                 cost[e] += stage_cost
+                discounted[e] += self.module.DISCOUNT**k * stage_cost
                 over[e], steps[e] = over[e] + _violates(plants[e]), steps[e] + 1
             running = running[goes_on]
             if not len(running):
                 break
-        return Loops(cost, np.array([bool(plant.success()) for plant in plants]), over / np.maximum(steps, 1))
+        success = np.array([bool(plant.success()) for plant in plants])
+        return Loops(cost, success, over / np.maximum(steps, 1), discounted)
 
     def _started(self, rng: np.random.Generator) -> tuple[Any, Array]:
         plant = self.module.Plant()
@@ -177,11 +195,13 @@ class Loops(NamedTuple):
         cost: Of each episode, ``(n,)``.
         success: Whether it ended well, ``(n,)``.
         violated: In which share of its steps it violated a limit, ``(n,)``; NaN where the plant has none.
+        discounted: Discounted cost of each episode, by the plant file's ``DISCOUNT``, ``(n,)``.
     """
 
     cost: Array
-    success: NDArray[np.bool_]
+    success: NDArray[Any]
     violated: Array
+    discounted: Array
 
 
 def _violates(plant: Any) -> float:
@@ -193,7 +213,7 @@ def _violates(plant: Any) -> float:
 class _Batched:
     """A policy on those episodes that still run; what it remembers of the others is dropped."""
 
-    def __init__(self, policy: MPCPolicy) -> None:
+    def __init__(self, policy: Predictor) -> None:
         self._policy = policy
         self._state: Any = None
         self._running: NDArray[np.int_] | None = None
