@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,7 +14,9 @@ import gymnasium as gym
 import minari
 import numpy as np
 import pytest
+import rich
 import torch
+from rich.console import Console
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
@@ -137,10 +140,12 @@ def test_an_existing_id_is_refused_unless_overwritten() -> None:
         assert minari.load_dataset("test/once-v0").total_steps == steps
 
 
-def test_the_progress_bar_shows_the_running_return(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_progress_bar_shows_the_running_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr(rich, "_console", Console(file=stream, force_terminal=True, width=100, color_system=None))
     dataset = collect("pendulum", steps=220, dataset_id="test/bar-v0")
     mean = return_curve(dataset)[:2].mean()
-    shown = capsys.readouterr().out
+    shown = stream.getvalue()
     assert "DDPG learns pendulum" in shown
     assert f"return {mean:.1f}" in shown
 

@@ -1,4 +1,4 @@
-"""A learner on shards: by one process, by two of which one is killed, and what all of them hand out."""
+"""A learner on shards: by one process, by two (kills: scripts/test_sharded), and what all of them hand out."""
 
 from __future__ import annotations
 
@@ -37,15 +37,14 @@ def test_another_plant_is_refused_before_anything_is_learned(folder: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_two_processes_of_which_one_is_killed_learn_what_one_learns(folder: Path, tmp_path: Path) -> None:
+def test_two_processes_learn_what_one_learns(folder: Path, tmp_path: Path) -> None:
     alone, _ = sharded_fit.fitted(folder, tmp_path / "alone.ckpt")
     program = Path(sharded_fit.__file__)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "--max-restarts=3"]
-    command += [str(program), str(folder), str(tmp_path / "two.ckpt"), str(tmp_path / "two"), "--dies", "1", "6"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    command += [str(program), str(folder), str(tmp_path / "two.ckpt"), str(tmp_path / "two")]
     path = os.pathsep.join([str(ROOT), str(program.parent)])
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3_000:]
-    assert "-9" in done.stderr  # as torchrun says it
     first, second = (np.load(tmp_path / f"two-{rank}.npy") for rank in (0, 1))
     assert np.array_equal(first, second)
     assert np.array_equal(first, alone.theta)
