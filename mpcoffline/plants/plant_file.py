@@ -35,13 +35,13 @@ def load_plant(path: str | Path) -> Plant:
 
 
 def load_description(path: str | Path) -> Plant | BlackBoxPlant:
-    """Runs a plant file as :func:`load_plant` does, and takes a plant without equations, too.
+    """Runs a plant file as :func:`~mpcoffline.load_plant` does, and takes a plant without equations, too.
 
     Args:
         path: The file.
 
     Raises:
-        StorageError: As :func:`load_plant`.
+        StorageError: As :func:`~mpcoffline.load_plant`.
         InvalidDataError: Likewise, but for a plant without equations.
     """
     file = Path(path)

@@ -170,7 +170,7 @@ class ShardedTable:
         raise other._empty(0)
 
     def columns(self, block: Any) -> Columns:
-        """The five columns of a block of rows in units, as :meth:`TransitionTable.columns`."""
+        """The five columns of a block of rows in units, as :meth:`~mpcoffline.TransitionTable.columns`."""
         return self.centring.columns(block)
 
     def batches(self, batch_size: int, seed: int) -> Iterator[list[tuple[float, torch.Tensor]]]:
