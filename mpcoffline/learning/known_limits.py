@@ -26,7 +26,8 @@ def limit_costs_of(mpc: MPC, table: TransitionTable) -> LimitCosts | None:
 
     Logged costs are explained by the MPC's stage cost, a quadratic in (s, a) and P. They contain it where the
     coefficient of P is nearer to the unit of the log than to zero. That unit is the scale of the MPC's stage cost where
-    this is the logged one (:func:`~mpcoffline.learning.known_cost.known_cost`), else the ratio of their spreads.
+    this is the logged one (:func:`~mpcoffline.learning.known_cost.known_cost`), else the ratio of their spreads, without
+    what P explains.
 
     Args:
         mpc: Its limits and its stage cost.
@@ -47,12 +48,13 @@ def limit_costs_of(mpc: MPC, table: TransitionTable) -> LimitCosts | None:
     ours, P = (each(s.T, a.T, mpc.theta).full().ravel() for each in (mpc.stage_function, function))
     if not len(logged) or not np.isfinite(np.stack([ours, P])).all():
         return LimitCosts(function, mpc.theta, 1.0, False)
-    unit = known.scale if known is not None else _ratio(logged, ours)
-    if not P.std() > 0.0:
-        return LimitCosts(function, mpc.theta, unit, False)
-    inputs = np.hstack([s, a])
-    quadratic = RandomFeatures(inputs, 0, np.random.default_rng(0))(inputs)
-    share = _coefficient(logged, P, np.column_stack([ours, quadratic]))
+    share = 0.0
+    if P.std() > 0.0:
+        inputs = np.hstack([s, a])
+        quadratic = RandomFeatures(inputs, 0, np.random.default_rng(0))(inputs)
+        share = _coefficient(logged, P, np.column_stack([ours, quadratic]))
+    # Where a log costs little but for its violations, what they cost says nothing of the unit of the rest.
+    unit = known.scale if known is not None else _ratio(logged - share * P, ours)
     contained = share > 0.5 * unit
     return LimitCosts(function, mpc.theta, share if contained and known is None else unit, contained)
 

@@ -95,6 +95,20 @@ def test_where_the_cost_is_another_one() -> None:
     assert limit_costs_of(limited(None), paid()) is None
 
 
+def test_a_log_that_costs_little_but_for_its_violations() -> None:
+    """What they cost says nothing of the unit of the rest: found as contained, beside noise and another stage cost."""
+    room = StateBounds(ROOM.low, ROOM.high, "room", Penalty(300.0, 1000.0))
+    other = limited(room, W=np.diag([2.0, 0.7]), R=[[0.4]])
+    noise = 0.05 * LOG.values().costs.std() * np.random.default_rng(0).normal(size=len(LOG))
+    within, apart = (limit_costs_of(other, paid(7.0, limits=noise + limits)) for limits in (100.0 * price(STATES), 0.0))
+    assert within is not None
+    assert apart is not None
+    assert (apart.logged, within.logged) == (False, True)
+    assert within.scale == pytest.approx(7.0, rel=0.02)
+    clean = within.without(paid(7.0, limits=noise + 100.0 * price(STATES))).costs
+    np.testing.assert_allclose(clean, paid(7.0, limits=noise).costs, atol=0.1 * 7.0 * LOG.values().costs.std())
+
+
 def test_v_sees_them() -> None:
     """As much as they cost at least: what comes after costs, too."""
     beyond = STATES[over(STATES).max(axis=1) > 0.3]
