@@ -26,8 +26,8 @@ def limit_costs_of(mpc: MPC, table: TransitionTable) -> LimitCosts | None:
 
     Logged costs are explained by the MPC's stage cost, a quadratic in (s, a) and P. They contain it where the
     coefficient of P is nearer to the unit of the log than to zero. That unit is the scale of the MPC's stage cost where
-    this is the logged one (:func:`~mpcoffline.learning.known_cost.known_cost`), else the ratio of their spreads, without
-    what P explains.
+    this is the logged one (:func:`~mpcoffline.learning.known_cost.known_cost`), else the ratio of their spreads,
+    without what P explains.
 
     Args:
         mpc: Its limits and its stage cost.
