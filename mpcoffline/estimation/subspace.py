@@ -24,7 +24,8 @@ AHEAD = 15  #: Steps that are predicted to judge a model, or as many as episodes
 _LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # of outputs and inputs that an output is regressed on
 _ROWS_A_NUMBER = 3  # that are the least to learn it from
 _LONGEST_DELAY = 15
-_FOLDS = 4
+_FOLDS, _PIECES = 4, 8  # longer episodes than this part of the rows are cut
+_NEGLIGIBLE = 1e-3  # spreads: no model is better for missing less, as of a log without noise
 _AS_GOOD, _NEAR = 1.02, 1.2  # times the least error: simpler models are taken as far as this; if that may be chance
 _RIDGE = 1e-9  # of the largest variance of a regressor
 _ORDERS = (*range(1, 9), 10, 12, 16)  # numbers of states
@@ -102,7 +103,7 @@ def linear_model(
         n_outputs: How many outputs there are.
         signals: Columns of the observation that may move the plant: the present values of signals.
         delay: Dead time of each input in steps, ``(nu,)``; None for one that is looked for, as all are by default.
-        seed: Chooses the episodes that judge.
+        seed: Chooses what is held out: episodes, or pieces of long ones.
 
     Raises:
         InvalidArgumentError: For columns that are not there, or dead times of another number than inputs.
@@ -206,7 +207,11 @@ class _Search:
     def _best(self, delay: tuple[int, ...], moving: NDArray[np.bool_], lags: Sequence[int] = ()) -> _Tried:
         """The simplest kind of model of those that predict best."""
         acting = self._data.late(delay, moving)
-        return _simplest([each for p in lags or self._lags for each in self._tried(p, delay, acting)])
+        tried = [each for p in lags or self._lags for each in self._tried(p, delay, acting)]
+        if not tried:
+            actual = "stretches of which none is left where another is held out"
+            raise InvalidDataError("log", expected="rows to fit and others to judge by", actual=actual)
+        return _simplest(tried)
 
     def _tried(self, lags: int, delay: tuple[int, ...], acting: list[Array]) -> list[_Tried]:
         """Models of all orders: each quarter of the episodes is predicted by what the others gave."""
@@ -214,6 +219,8 @@ class _Search:
         episodes = []
         for fold in range(_FOLDS):
             fit, held_out = (self._part(lags, acting, fold, judging=judging) for judging in (False, True))
+            if len(fit.now) <= fit.past.shape[1]:
+                return []
             windows = self._windows(held_out)
             episodes.append(held_out.episode[windows])
             for model in self._fitted(fit, lags, _ORDERS, acting):
@@ -306,8 +313,9 @@ def _simplest(tried: Sequence[_Tried]) -> _Tried:
     That is within 2 %, or within a fifth where episodes held out do not say for sure that it is worse.
     """
     best = min(tried, key=lambda each: each.error)
-    near = [each for each in tried if each.error <= _NEAR * best.error]
-    good = [each for each in near if each.error <= _AS_GOOD * best.error or not _clearly_worse(each, best)]
+    least = max(best.error, _NEGLIGIBLE)
+    near = [each for each in tried if each.error <= _NEAR * least]
+    good = [each for each in near if each.error <= _AS_GOOD * least or not _clearly_worse(each, best)]
     return min(good, key=lambda each: (each.order, each.error))
 
 
@@ -317,11 +325,16 @@ def _clearly_worse(one: _Tried, other: _Tried) -> bool:
 
 
 def _folds(episodes: NDArray[np.intp], seed: int) -> NDArray[np.intp]:
-    """The part ``(n,)`` that each row is held out with: whole episodes, or quarters of the rows where these are few."""
-    n_episodes = int(episodes[-1]) + 1
-    if n_episodes < _FOLDS:
-        return np.arange(len(episodes)) * _FOLDS // len(episodes)
-    return np.random.default_rng(seed).permutation(np.arange(n_episodes) % _FOLDS)[episodes]
+    """The quarter ``(n,)`` that each row is held out with: of whole episodes, or of pieces of long ones."""
+    n = len(episodes)
+    begins = np.append(True, episodes[1:] != episodes[:-1])
+    within = (np.arange(n) - np.maximum.accumulate(np.where(begins, np.arange(n), 0))) // -(-n // _PIECES)
+    piece = np.cumsum(begins | np.append(False, within[1:] != within[:-1])) - 1
+    order = np.random.default_rng(seed).permutation(int(piece[-1]) + 1)
+    before = np.cumsum(np.bincount(piece)[order]) - np.bincount(piece)[order]
+    fold = np.empty(len(order), dtype=np.intp)
+    fold[order] = before * _FOLDS // n
+    return np.asarray(fold[piece])
 
 
 def _least_squares(inputs: Array, outputs: Array) -> Array:
@@ -340,12 +353,13 @@ def _runs(episode: NDArray[np.intp], step: NDArray[np.intp]) -> Iterator[tuple[i
 def _beginnings(model: _Fitted, data: ScaledEpisodes, acting: list[Array], lags: int) -> tuple[Array, Array]:
     """Mean and spread of the states where episodes begin: by least squares on their first outputs, before a prior."""
     n, found, left = len(model.A), list[Array](), np.zeros((len(model.A),) * 2)
+    noise = np.maximum(model.noise, _NEGLIGIBLE)
     for y, w in zip(data.y, acting, strict=True):
         forced, seen = np.zeros(n), np.eye(n)
         rows, values = [], []
         for k in range(min(len(w), max(2 * n, lags)) + 1):
-            rows.append(model.C @ seen / model.noise[:, None])
-            values.append((y[k] - model.C @ forced - model.c) / model.noise)
+            rows.append(model.C @ seen / noise[:, None])
+            values.append((y[k] - model.C @ forced - model.c) / noise)
             if k < len(w):
                 forced, seen = model.A @ forced + model.B @ w[k], model.A @ seen
         H, v = np.vstack(rows), np.concatenate(values)

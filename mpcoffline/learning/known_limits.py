@@ -56,7 +56,9 @@ def limit_costs_of(mpc: MPC, table: TransitionTable) -> LimitCosts | None:
     # Where a log costs little but for its violations, what they cost says nothing of the unit of the rest.
     unit = known.scale if known is not None else _ratio(logged - share * P, ours)
     contained = share > 0.5 * unit
-    return LimitCosts(function, mpc.theta, share if contained and known is None else unit, contained)
+    if known is None:
+        unit = share if contained else _ratio(logged, ours)
+    return LimitCosts(function, mpc.theta, unit, contained)
 
 
 def with_limit_costs(known: Known) -> Known:

@@ -124,6 +124,24 @@ def test_few_long_episodes_do(n_episodes: int) -> None:
     assert np.isfinite(found.start_spread).all()
 
 
+def test_a_log_without_noise_asks_for_no_states_to_fit_rounding() -> None:
+    found = linear_model(logged(12, 40, delay=0, noise=0.0), 2, [2], [0, 0])
+    assert found.order == 3
+    np.testing.assert_allclose(gains(found)[:, :3], TRUE_GAINS, atol=0.05)
+    assert np.isfinite(found.start).all()
+
+
+def test_one_long_stretch_and_fragments_do() -> None:
+    """As of a plant in operation: whatever is held out, rows are left to fit."""
+    parts = [logged(1, 500, delay=0), logged(6, 5, delay=0, seed=1)]
+    columns = [np.concatenate(each) for each in zip(*(part.values() for part in parts), strict=True)]
+    ids = np.concatenate([parts[0].episode_ids, parts[1].episode_ids + 1])
+    s, a, costs, s_next, ends = columns
+    found = linear_model(TransitionTable.from_arrays(s, a, costs, s_next, ends, ids), 2, [2], [0, 0])
+    assert found.order == 3
+    np.testing.assert_allclose(gains(found)[:, :3], TRUE_GAINS, atol=2.0)
+
+
 def changed(**columns: Any) -> TransitionTable:
     log = logged(2, 20)
     c = log.values()
