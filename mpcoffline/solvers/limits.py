@@ -12,6 +12,22 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Penalty, StateBounds
 
 
+class Rates(NamedTuple):
+    """Hard limits ``-down <= u_i - (the input of the step before) <= up``: bounds that move with what x carries.
+
+    Attributes:
+        elements: Which elements of the limits they are, ``(n,)``.
+        places: Where in x the input of the step before stands, ``(nu,)``; -1 for an input without such a limit.
+        up: Largest rise in a step, ``(nu,)``; inf where there is no limit.
+        down: Largest fall.
+    """
+
+    elements: NDArray[np.bool_]
+    places: NDArray[np.intp]
+    up: Array
+    down: Array
+
+
 class Limits(NamedTuple):
     """All elements h_j <= 0, in three blocks: of constraints along the horizon, of state bounds, of those at the end.
 
@@ -26,6 +42,7 @@ class Limits(NamedTuple):
         n_stage: Elements of the first block.
         n_bounds: Of the second.
         by_input: Which elements depend on the input, ``(n,)``: no other one can be changed at stage 0.
+        rates: Those that only say by how much an input may change.
     """
 
     stage: ca.SX
@@ -36,6 +53,7 @@ class Limits(NamedTuple):
     n_stage: int
     n_bounds: int
     by_input: NDArray[np.bool_]
+    rates: Rates
 
 
 def limits_of(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> Limits | None:
@@ -66,16 +84,58 @@ def limits_of(mpc: MPC, x: ca.SX, u: ca.SX, theta: ca.SX) -> Limits | None:
         return None
     by_input = np.zeros(len(labels), dtype=bool)
     by_input[: along.numel()] = depends_on_input(along, u)
+    l1 = np.array([np.inf if p is None else p.l1 for p in penalties])
     return Limits(
         ca.vertcat(along, bounds),
         ca.vertcat(bounds, end),
         tuple(labels),
-        np.array([np.inf if p is None else p.l1 for p in penalties]),
+        l1,
         np.array([0.0 if p is None else p.l2 for p in penalties]),
         along.numel(),
         bounds.numel(),
         by_input,
+        _rates(mpc, along, l1, (x, u, theta)),
     )
+
+
+def changes(mpc: MPC, h: ca.SX, symbols: tuple[ca.SX, ca.SX, ca.SX]) -> list[tuple[int, float, float] | None]:
+    """Which elements of h say that ``s (u_i - (u_i of the step before)) <= most``: i, s = 1 or -1, most in u's unit.
+
+    Args:
+        mpc: The problem.
+        h: Of a constraint along the horizon, ``(n, 1)``.
+        symbols: x, u and theta.
+    """
+    nx, nu = mpc.nx, mpc.nu
+    if not mpc.layout.has_previous or min(mpc.layout.carried) < 1:
+        return [None] * h.numel()
+    z = ca.vertcat(*symbols)
+    jacobian = ca.jacobian(h, z)
+    is_constant = [jacobian[j, :].is_constant() for j in range(h.numel())]
+    value = ca.Function("h", [z], [jacobian, h])
+    slopes, at_zero = (part.full() for part in value(0.0))
+    found: list[tuple[int, float, float] | None] = []
+    for j, row in enumerate(slopes):
+        places = np.flatnonzero(row).tolist()
+        i = places[1] - nx if len(places) == 2 else -1  # of two, the input comes after the state
+        is_change = (
+            is_constant[j] and 0 <= i < nu and places[0] == mpc.layout.previous[i] and row[nx + i] == -row[places[0]]
+        )
+        found.append((i, np.sign(row[nx + i]), -at_zero[j, 0] / abs(row[nx + i])) if is_change else None)
+    return found
+
+
+def _rates(mpc: MPC, along: ca.SX, l1: Array, symbols: tuple[ca.SX, ca.SX, ca.SX]) -> Rates:
+    """Of the hard ones, those that any input can keep: the input before among them."""
+    places, up, down = np.full(mpc.nu, -1), np.full(mpc.nu, np.inf), np.full(mpc.nu, np.inf)
+    elements = np.zeros(len(l1), dtype=bool)
+    for j, change in enumerate(changes(mpc, along, symbols)):
+        if change is None or np.isfinite(l1[j]) or not change[2] >= 0.0:
+            continue
+        i, sign, most = change
+        side = up if sign > 0.0 else down
+        elements[j], places[i], side[i] = True, mpc.layout.previous[i], min(side[i], most)
+    return Rates(elements, places, up, down)
 
 
 def depends_on_input(h: ca.SX, u: ca.SX) -> NDArray[np.bool_]:

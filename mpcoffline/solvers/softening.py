@@ -14,6 +14,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Constraint, Penalty, StateBounds
 
 from .ddp import DDPSolver
+from .limits import changes
 
 _DEARER = 10.0  # than the largest multiplier that was seen: other states may have larger ones
 
@@ -24,8 +25,8 @@ def softened(mpc: MPC, x: ArrayLike) -> MPC:
     An l1 above a limit's largest multiplier changes no solution of a problem that can keep it; where none can, as after
     a disturbance, the violation is as small as it must be, and the problem is solved. The price of each limit is ten
     times the largest multiplier of the problems from the states ``x``, and no less than a hundred spreads of the stage
-    cost over that of the limit, among random input sequences: no unit matters. Limits of inputs alone stay hard, as any
-    plan can keep them; likewise what is soft already.
+    cost over that of the limit, among random input sequences: no unit matters. Limits of inputs alone and of their
+    changes stay hard, as any plan can keep them; likewise what is soft already.
 
     Example:
         >>> mpc = softened(mpc, table.observations[::100])
@@ -79,7 +80,8 @@ def _elements(mpc: MPC) -> Iterator[tuple[Constraint | StateBounds, slice, bool]
         else:
             h = mpc.constraint_expression(constraint)(*((x, theta) if constraint.terminal else (x, u, theta)))
         last = first + h.numel()
-        yield constraint, slice(first, last), constraint.soft is None and bool(ca.depends_on(h, x))
+        soften = constraint.soft is None and bool(ca.depends_on(h, x)) and None in changes(mpc, h, (x, u, theta))
+        yield constraint, slice(first, last), soften
         first = last
 
 

@@ -48,6 +48,19 @@ def mpc_of(case: str) -> MPC:
         )
         cost, end = (QuadraticCost(np.eye(2), R, tracks={0: "set_point"}) for R in ([[0.1]], None))
         return MPC(model, cost, end, 12, 0.95, [-1.0], [1.0])
+    if case == "rates":  # of one input of two, beside a soft limit
+
+        def changes(x: ca.SX, u: ca.SX, before: ca.SX, p: object) -> ca.SX:
+            change = u[0] - before[0]
+            return ca.vertcat(change - 0.2, -change - 0.1)
+
+        model = Model(lambda x, u, p: 0.9 * x + ca.vertcat(0.2 * u[0] + 0.1 * u[1], 0.1 * x[0] + 0.3 * u[1]), 2, 2, 1.0)
+        cost, low = QuadraticCost(np.eye(2), 0.01 * np.eye(2), x_ref=[1.0, 2.0]), [-np.inf, -1.0]
+        limits = [
+            Constraint(changes, "rates", uses_previous=True),
+            StateBounds(low, [0.9, np.inf], "level", Penalty(5.0)),
+        ]
+        return MPC(model, cost, QuadraticCost(np.eye(2)), 15, 0.97, [-1.0, -2.0], [1.0, 2.0], constraints=limits)
     if case == "turnpike":  # whose plans wait on their way
         model = Model(lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * u), 2, 1, 0.2, discrete=True)
         stage, goal = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]]), QuadraticCost(5.0 * np.eye(2), x_ref=[3.0, 0.0])
@@ -139,6 +152,7 @@ def compiled(folder: Path, *flags: str, main: str = "mpc_test.c") -> Path:
         "late inputs",
         "limits",
         "limits of stages",
+        "rates",
         "signals",
         "signals, no bounds",
         "signals on time",

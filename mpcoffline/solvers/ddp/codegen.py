@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import resources
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from mpcoffline.core import limits
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layers import layered
 from mpcoffline.solvers.limits import Limits, limits_of
@@ -42,7 +44,7 @@ def source(mpc: MPC) -> str:
 
 def algorithm(mpc: MPC) -> str:
     """What iterates: ``core.c``, with what limits need around it, if there are any."""
-    names = ["core.c"] if mpc.constraints is None else ["constraints.h", "core.c", "constraints.c"]
+    names = ["core.c"] if mpc.constraints is None else ["constraints.h", "core.c", "constraints.c", "rates.c"]
     return "\n\n".join(text(name) for name in names)
 
 
@@ -91,7 +93,7 @@ class _Problem(NamedTuple):
         others: tuple[object, ...] = ()
         if self.kept is not None:
             outputs += [self.kept.stage, self.kept.end]
-            numbers = self.kept.l1, self.kept.l2, self.kept.by_input
+            numbers = self.kept.l1, self.kept.l2, self.kept.by_input, *self.kept.rates
             others = (self.kept.n_stage, *(array.tobytes() for array in numbers))
         return ca.Function("problem", [self.x, self.u, self.theta], outputs).serialize(), self.convex, others
 
@@ -163,6 +165,7 @@ def limit_functions(limits: Limits, x: ca.SX, u: ca.SX) -> dict[str, tuple[list[
     y, dy = (ca.SX.sym(name, limits.stage.numel()) for name in ("y", "dy"))
     y_end, dy_end = (ca.SX.sym(name, limits.end.numel()) for name in ("y", "dy"))
     slope = ca.jacobian(limits.stage, z)
+    slope[np.flatnonzero(limits.rates.elements).tolist(), :] = 0.0  # rates are bounds, which cost nothing
     gradient, hessian = slope.T @ y, slope.T @ ca.diag(dy) @ slope
     end_slope = ca.jacobian(limits.end, x)
     return {
@@ -182,19 +185,29 @@ def limit_functions(limits: Limits, x: ca.SX, u: ca.SX) -> dict[str, tuple[list[
 def limit_constants(limits: Limits | None) -> str:
     """How many limits there are, and their prices."""
     if limits is None:
-        return "#define LIMITS 0"
-    arrays = [
-        f"static const double {name}[] = {{{', '.join(map(literal, values))}}};"
-        for name, values in (("limit_l1", limits.l1), ("limit_l2", limits.l2))
-    ]
+        return "#define LIMITS 0\n#define RATES 0"
+    arrays = [_doubles("limit_l1", limits.l1), _doubles("limit_l2", limits.l2)]
     sizes = {
         "LIMITS": len(limits.labels),
         "STAGE_LIMITS": limits.stage.numel(),
         "END_FIRST": limits.n_stage,
     }
-    by_input = ", ".join(str(int(v)) for v in limits.by_input)
-    defined = [f"#define {name} {value}" for name, value in sizes.items()]
-    return "\n".join([*defined, *arrays, f"static const int limit_by_input[] = {{{by_input}}};"])
+    sizes["RATES"] = int(limits.rates.elements.sum())
+    arrays.append(_integers("limit_by_input", limits.by_input))
+    arrays.append(_integers("limit_is_rate", limits.rates.elements))
+    if sizes["RATES"]:
+        arrays.append(_integers("rate_place", limits.rates.places))
+        arrays.append(_doubles("rate_up", limits.rates.up))
+        arrays.append(_doubles("rate_down", limits.rates.down))
+    return "\n".join([*(f"#define {name} {value}" for name, value in sizes.items()), *arrays])
+
+
+def _doubles(name: str, values: Array) -> str:
+    return f"static const double {name}[] = {{{', '.join(map(literal, values))}}};"
+
+
+def _integers(name: str, values: NDArray[Any]) -> str:
+    return f"static const int {name}[] = {{{', '.join(str(int(value)) for value in values)}}};"
 
 
 def _layers(mpc: MPC, theta: ca.SX) -> LayeredCode | None:

@@ -1,8 +1,14 @@
 /* The outer loop of limits: multipliers, weights, and when a problem is solved or cannot be. See constraints.h. */
 
+#if LIMITS > RATES
 #define FIRST_TOLERANCE 1e-3 /* of the first minimisation; a tenth after each, down to the tolerance */
 #define WARM_TOLERANCE 1e-5  /* likewise, from a plan */
 #define MOST_INNER 60        /* iterations of a minimisation, before it may be of use to know the multipliers better */
+#else /* there are no multipliers: one minimisation is all */
+#define FIRST_TOLERANCE 0.0
+#define WARM_TOLERANCE 0.0
+#define MOST_INNER INFINITY
+#endif
 #define FIRST_WEIGHT 1e2     /* times a spread of a stage's costs over that of h */
 #define GROWTH 5.0           /* of the weight of an element that came closer by less than */
 #define CLOSER 4.0

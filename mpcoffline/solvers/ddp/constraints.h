@@ -11,7 +11,8 @@
  * phi. Elements are in three blocks: of constraints along the horizon, of state bounds, and of constraints at the end.
  *
  * Included after generated code that defines LIMITS, STAGE_LIMITS (of the first two blocks), END_FIRST (of the first), the
- * arrays limit_l1, limit_l2 and limit_by_input, and
+ * arrays limit_l1, limit_l2, limit_by_input and limit_is_rate (of hard limits to what an input may change by in a step:
+ * core.c never leaves these, so they press on nothing, and are only looked at), and
  *   gen_h(x, u, p, out):      h [STAGE_LIMITS]
  *   gen_h_end(x, p, out):     h [LIMITS - END_FIRST]
  *   gen_limits(x, u, y, dy, p, out):  h_z'y and h_z' diag(dy) h_z, in the order of gen_q from Qx on
@@ -44,8 +45,21 @@ typedef struct {
     int given;                                        /* whether the first input is imposed */
 } limits;
 
-/* No input changes these: they are reported, not imposed. */
-static inline int is_imposed(const limits *c, int64_t k, int j) { return k || (limit_by_input[j] && !c->given); }
+#if RATES
+/* What the Riccati recursion knows of inputs that are at their rates; see rates.c. */
+typedef struct {
+    vd up[NU], down[NU], place[NU]; /* of V at the next stage: by what its slope is larger above, smaller below this input */
+    vd rise[NU], fall[NU];          /* slopes of Q above and below */
+    vd low[NU], high[NU], g[NU];    /* bounds of a step, and the slope it looks at */
+    vl stops[NU];                   /* inputs that go no farther than the kink */
+    vl follows[NU];                 /* and those that move with the one before */
+} kinks;
+#endif
+
+/* Others cannot be changed by any input, or are kept anyway: they are reported, not imposed. */
+static inline int is_imposed(const limits *c, int64_t k, int j) {
+    return !limit_is_rate[j] && (k || (limit_by_input[j] && !c->given));
+}
 
 /* phi; zero for a hard one. */
 static inline vd due(int j, vd h) {

@@ -82,7 +82,7 @@ static void first_limits(const mpc_problem *m, mpc_state *state, lanes *w) {
     for (int c = 0; c < N_CANDIDATES; ++c) {
         for (int k = 0; k < MPC_HORIZON; ++k)
             for (int a = 0; a < NU; ++a) w->u[k * NU + a] = candidate(c, k, a);
-        rollout_open(m, w, w->x, w->u, &w->size);
+        rollout_open(m, w, w->x, w->u, all_lanes(), &w->size);
         note(m, w, &s);
     }
     conclude(m, &s, rho + LIMITS, rho + 2 * LIMITS);
@@ -99,7 +99,7 @@ static void keep(double *x, double *u, const double *from_x, const double *from_
 
 /* The states and the cost of the inputs w->u. */
 static void roll_out(const mpc_problem *m, lanes *w) {
-    w->J = rollout_open(m, w, w->x, w->u, &w->size);
+    w->J = rollout_open(m, w, w->x, w->u, all_lanes(), &w->size);
 #if LIMITS
     for (int i = 0; i < (MPC_HORIZON + 1) * LIMITS; ++i) w->c.h[i] = w->c.h_new[i];
     w->c.base = w->c.base_new, w->c.base_size = w->c.base_size_new;
@@ -145,7 +145,7 @@ static int solve_cold(const mpc_problem *m, mpc_state *state, lanes *w) {
     for (int c = 0; c < N_CANDIDATES; ++c) {
         for (int k = 0; k < MPC_HORIZON; ++k)
             for (int a = 0; a < NU; ++a) w->u[k * NU + a] = candidate(c, k, a);
-        J[c] = rollout_open(m, w, w->x, w->u, &w->size);
+        J[c] = rollout_open(m, w, w->x, w->u, all_lanes(), &w->size);
         if (!(J[c] < INFINITY)) J[c] = INFINITY;
     }
     for (int l = 0; l < MPC_STARTS; ++l) {

@@ -23,7 +23,9 @@
  *
  * No unit matters: costs are compared with the size of their own terms, inputs with those of the plan or their range.
  *
- * Where there are limits besides the bounds of inputs (LIMITS > 0), constraints.h comes before and constraints.c after.
+ * Where there are limits besides the bounds of inputs (LIMITS > 0), constraints.h comes before and constraints.c after. Where
+ * there are some to what inputs may change by (RATES > 0), input a stays within rate_down[a] and rate_up[a] of the one
+ * before, x[rate_place[a]] (-1: it has none): no trajectory leaves that, and an input at such a bound moves along with it.
  */
 #include <stdint.h>
 
@@ -86,6 +88,13 @@ typedef struct {
 static void press_stage(const limits *c, int64_t k, const vd *x, const vd *u, const vd *p, vd *out);
 static void press_end(const limits *c, int64_t N, const vd *x, const vd *p, vd *out);
 static void look(const mpc_problem *m, lanes *w);
+#if RATES
+static kinks no_kinks(void);
+static void before_step(const mpc_problem *m, const lanes *w, int64_t k, const vd *x, const vd *u, const vd *Qu, kinks *v);
+static void after_step(const mpc_problem *m, const lanes *w, int64_t k, const vd *x, const vd *u, vd H[NU][NU], const vd *d,
+                       const vl *is_free, kinks *v);
+static void follow(vd H[NU][NU], const vl *is_free, const kinks *v, int i, vd *b);
+#endif
 #else
 #define TOLERANCE_OF(m, w) (m)->tolerance
 #define LOOSER(w) 1.0
@@ -95,6 +104,19 @@ static inline vl all_lanes(void) { return vd_le(V(0.0), V(0.0)); }
 static inline vl no_lanes(void) { return vd_lt(V(0.0), V(0.0)); }
 
 static inline vd clip(vd a, vd low, vd high) { return vd_min(vd_max(a, low), high); }
+
+/* The bounds of a stage's inputs. Where inputs before are out of bounds, rates may not be kept. */
+static inline void bounds_at(const mpc_problem *m, const lanes *w, int64_t k, const vd *x, vd *low, vd *high) {
+    (void)x;
+    for (int a = 0; a < NU; ++a) low[a] = k ? V(m->low[a]) : w->low0[a], high[a] = k ? V(m->high[a]) : w->high0[a];
+#if RATES
+    for (int a = 0; a < NU && (k || !w->c.given); ++a) {
+        if (rate_place[a] < 0) continue;
+        vd before = x[rate_place[a]], lowest = clip(before - rate_down[a], low[a], high[a]);
+        high[a] = clip(before + rate_up[a], low[a], high[a]), low[a] = lowest;
+    }
+#endif
+}
 
 #if LIMITS
 /* The end of a rollout: keeps the cost J and its size as they are without the limits, and returns J with them. */
@@ -106,8 +128,9 @@ static vd add_prices(const mpc_problem *m, lanes *w, double weight, const vd *x,
 }
 #endif
 
-/* x+ and J along (x, u) -> open-loop states from s; returns the cost, and sets its size. */
-static vd rollout_open(const mpc_problem *m, lanes *w, vd *x, const vd *u, vd *size) {
+/* x+ and J along (x, u) -> open-loop states from s; returns the cost, and sets its size. The inputs of lanes that are any
+ * guess are made such that they change as they may. */
+static vd rollout_open(const mpc_problem *m, lanes *w, vd *x, vd *u, vl any_guess, vd *size) {
     vd J = V(0.0), out[NX + 1];
     *size = V(0.0);
     double weight = 1.0;
@@ -115,7 +138,13 @@ static vd rollout_open(const mpc_problem *m, lanes *w, vd *x, const vd *u, vd *s
     vd prices = V(0.0), price_size = V(0.0);
 #endif
     for (int i = 0; i < NX; ++i) x[i] = w->s[i];
+    (void)any_guess;
     for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
+#if RATES
+        vd low[NU], high[NU];
+        bounds_at(m, w, k, x + k * NX, low, high);
+        for (int a = 0; a < NU; ++a) u[k * NU + a] = vd_select(any_guess, clip(u[k * NU + a], low[a], high[a]), u[k * NU + a]);
+#endif
         gen_step(x + k * NX, u + k * NU, w->p, out);
         for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
         J += weight * out[NX];
@@ -145,13 +174,14 @@ static void rollout(const mpc_problem *m, lanes *w, vd alpha) {
     for (int i = 0; i < NX; ++i) x[i] = w->s[i];
     for (int64_t k = 0; k < m->horizon; ++k, weight *= m->discount) {
         const vd *K = w->K + k * NU * NX;
-        vd dx[NX], *u = w->u_new + k * NU;
+        vd dx[NX], *u = w->u_new + k * NU, low[NU], high[NU];
+        bounds_at(m, w, k, x + k * NX, low, high);
         for (int i = 0; i < NX; ++i) dx[i] = x[k * NX + i] - w->x[k * NX + i];
         for (int a = 0; a < NU; ++a) {
             vd v = w->u[k * NU + a] + alpha * w->k[k * NU + a];
             /* No feedback at k = 0, where dx = 0: a derivative that is singular at s alone gives a K that is NaN. */
             for (int i = 0; i < NX && k; ++i) v += K[i * NU + a] * dx[i];
-            u[a] = clip(v, k ? V(m->low[a]) : w->low0[a], k ? V(m->high[a]) : w->high0[a]);
+            u[a] = clip(v, low[a], high[a]);
         }
         gen_step(x + k * NX, u, w->p, out);
         for (int i = 0; i < NX; ++i) x[(k + 1) * NX + i] = out[i];
@@ -376,6 +406,9 @@ static void backward(const mpc_problem *m, lanes *w) {
     double weight = 1.0;
     for (int64_t k = 1; k < N; ++k) weight *= m->discount;
     vd discount = V(m->discount), square = V(0.0), change = V(0.0);
+#if RATES
+    kinks kink = no_kinks();
+#endif
     w->pd = all_lanes();
     vd predicted = V(0.0), defect = V(0.0), largest[NU];
     double ratio[NU][NU], ridge[NU];
@@ -395,7 +428,14 @@ static void backward(const mpc_problem *m, lanes *w) {
         for (int i = 0; i < NX && guessed; ++i) defect += weight * m->discount * vd_abs(Vx[i] * out[i]);
         /* Regularised in proportion to Quu: independent of units, and positive definite for any Quu from mu = 1 on. An
          * input without any curvature goes to its bounds, or stays if nothing depends on it. */
-        vd H[NU][NU], low[NU], high[NU], d[NU], F[NU][NU];
+        vd H[NU][NU], d[NU], F[NU][NU];
+#if RATES
+        before_step(m, w, k, w->x + k * NX, u, Qu, &kink);
+        const vd *g = kink.g, *low = kink.low, *high = kink.high;
+#else
+        vd low[NU], high[NU];
+        const vd *g = Qu;
+#endif
         for (int a = 0; a < NU; ++a) {
             vd size = V(0.0);
             for (int b = 0; b < NU; ++b) {
@@ -404,15 +444,23 @@ static void backward(const mpc_problem *m, lanes *w) {
             }
             H[a][a] += (w->mu + RIDGE) * size + (ridge[a] * vd_abs(Qu[a]) + TINY);
             largest[a] = vd_max(largest[a], vd_abs(u[a]));
+#if !RATES
             low[a] = (k ? V(m->low[a]) : w->low0[a]) - u[a];
             high[a] = (k ? V(m->high[a]) : w->high0[a]) - u[a];
+#endif
         }
         vl is_free[NU];
-        box_qp(H, Qu, low, high, d, is_free, F, &w->pd);
+        box_qp(H, g, low, high, d, is_free, F, &w->pd);
+#if RATES
+        after_step(m, w, k, w->x + k * NX, u, H, d, is_free, &kink);
+#endif
         vd *K = w->K + k * NU * NX;
         for (int i = 0; i < NX; ++i) {
             vd b[NU];
             for (int a = 0; a < NU; ++a) b[a] = vd_select(is_free[a], -Qux[i * NU + a], V(0.0));
+#if RATES
+            follow(H, is_free, &kink, i, b);
+#endif
             substitute(F, b);
             for (int a = 0; a < NU; ++a) K[i * NU + a] = b[a];
         }
@@ -425,8 +473,8 @@ static void backward(const mpc_problem *m, lanes *w) {
             square += size * before;
             change += size * (before - d[a]);
             w->k[k * NU + a] = d[a];
-            gradient[a] = Qu[a] + Quud;
-            slope += Qu[a] * d[a];
+            gradient[a] = g[a] + Quud;
+            slope += g[a] * d[a];
             half += 0.5 * d[a] * Quud;
             for (int i = 0; i < NX; ++i) {
                 M[a][i] = Qux[i * NU + a];

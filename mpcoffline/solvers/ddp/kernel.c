@@ -223,7 +223,7 @@ static void solve_range(const mpc_problem *m, const mpc_batch *b, lanes *w, int6
         if (!busy) break;
         if (fresh_any && b->theta_stride) gen_prepare(w->p, w->p + NP);
         if (fresh_any && b->guess == INPUTS) {
-            vd size, J = rollout_open(m, w, w->x_new, w->u, &size);
+            vd size, J = rollout_open(m, w, w->x_new, w->u, fresh, &size);
             for (int64_t k = 0; k < (m->horizon + 1) * NX; ++k) w->x[k] = vd_select(fresh, w->x_new[k], w->x[k]);
             w->J = vd_select(fresh, J, w->J);
             w->size = vd_select(fresh, size, w->size);
@@ -273,10 +273,11 @@ static void candidate_costs(const mpc_problem *m, lanes *w, const double *x0, co
     int64_t size = m->horizon * NU;
     load_theta(w, theta);
     for (int j = 0; j < NX; ++j) w->s[j] = V(x0[j]);
+    for (int a = 0; a < NU; ++a) w->low0[a] = V(u0 ? u0[a] : m->low[a]), w->high0[a] = V(u0 ? u0[a] : m->high[a]);
     for (int64_t c = 0; c < n_candidates; c += LANES) {
         for (int l = 0; l < LANES; ++l)
             for (int64_t k = 0; k < size; ++k) w->u[k][l] = u0 && k < NU ? u0[k] : candidates[(c + l) * size + k];
-        vd size, cost = rollout_open(m, w, w->x, w->u, &size);
+        vd size, cost = rollout_open(m, w, w->x, w->u, all_lanes(), &size);
         for (int l = 0; l < LANES; ++l) J[c + l] = cost[l] < INFINITY ? cost[l] : INFINITY;
 #if LIMITS
         if (w->c.asked) note(m, w, w->c.asked);
@@ -319,7 +320,7 @@ int mpc_limits(const mpc_problem *m, const mpc_batch *b, const double *candidate
         if (!b->u_guess) continue;
         vd size, cost, violation, worst, now;
         for (int64_t k = 0; k < m->horizon * NU; ++k) w->u[k] = V(b->u_guess[i * m->horizon * NU + k]);
-        w->J = rollout_open(m, w, w->x, w->u, &size);
+        w->J = rollout_open(m, w, w->x, w->u, no_lanes(), &size);
         for (int64_t k = 0; k < (m->horizon + 1) * LIMITS; ++k) w->c.h[k] = w->c.h_new[k];
         w->c.base = w->c.base_new;
         appraise(m, w, &cost, &violation, &worst, &now);

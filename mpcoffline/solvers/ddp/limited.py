@@ -67,9 +67,10 @@ class Limited:
     def words(self, result: dict[str, NDArray[Any]], ended: list[Status]) -> list[str]:
         """How each solve ended, with the limit that is violated where it failed."""
         words = []
-        for status, worst, amount in zip(ended, result["worst"].tolist(), result["amount"].tolist(), strict=True):
+        found = (result[name].tolist() for name in ("worst", "amount", "violation"))
+        for status, worst, amount, violation in zip(ended, *found, strict=True):
             stage, j = divmod(worst, len(self.labels))
-            named = status is not Status.CONVERGED and 0.0 < amount < np.inf
+            named = status is not Status.CONVERGED and violation > FEASIBLE and amount < np.inf
             words.append(
                 status + (f": {self.labels[j]!r} at stage {stage} is violated by {amount:.3g}" if named else "")
             )

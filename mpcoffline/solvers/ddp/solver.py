@@ -85,12 +85,13 @@ class DDPSolver(Solver):
     """Control-limited differential dynamic programming with Gauss-Newton Hessians, eight problems an instruction.
 
     Model, costs and their derivatives become C together with a small kernel, compiled once with the system's compiler
-    and cached. Input bounds are handled exactly (a box QP at each stage), other limits, hard and soft, by an augmented
-    Lagrangian: minimisations with multipliers that are made better after each, until every limit is kept to a millionth
-    of what it is measured by (how far it moves along the plan, or what the candidates make of it). Costs whose
-    class does not promise to be ``convex`` enter with the positive semidefinite part of their Hessian; stage costs that
-    are linear in the states (prices) with the curvature of the model besides, as they have none of their own, unless
-    the model is large (a network).
+    and cached. Input bounds are handled exactly (a box QP at each stage), and so are hard limits to what inputs change
+    by in a step: bounds that move with the input before, which every plan keeps. Other limits, hard and soft, are
+    handled by an augmented Lagrangian: minimisations with multipliers that are made better after each, until every
+    limit is kept to a millionth of what it is measured by (how far it moves along the plan, or what the candidates make
+    of it). Costs whose class does not promise to be ``convex`` enter with the positive semidefinite part of their
+    Hessian; stage costs that are linear in the states (prices) with the curvature of the model besides, as they have
+    none of their own, unless the model is large (a network).
 
     A cold problem is solved from 16 of 64 fixed input sequences, each the cheapest of four that are alike; the best
     four of different costs go on after three iterations, beside a plan that stays where the plant is (an unstable one
