@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from task_ids import CARTPOLE, PENDULUM
 
 from mpcoffline.envs import PLANTS
-from mpcoffline.mpc import MPC, Constraint, Model, Penalty, QuadraticCost, StateBounds
+from mpcoffline.mpc import MPC, Constraint, Model, ParameterSpace, Penalty, QuadraticCost, StateBounds
+from mpcoffline.mpc.component import Component
 from mpcoffline.plants.nominal import nominal_mpc
 
 Array = NDArray[np.float64]
@@ -211,6 +212,45 @@ def _lane_states(n: int, rng: np.random.Generator) -> Array:
     return rng.uniform([-0.5, -0.03, -0.02, -0.005], [0.5, 0.03, 0.02, 0.005], (n, 4))
 
 
+class Energy(Component):
+    """What a pump pays for, bar times per cent; nothing at the end."""
+
+    def __init__(self) -> None:
+        self.space = ParameterSpace(())
+
+    def expression(self, x: ca.SX, u: ca.SX, p: object) -> ca.SX:
+        """As a stage cost."""
+        return 0.005 * u[0] * x[0]
+
+    def terminal_expression(self, x: ca.SX, p: object) -> ca.SX:
+        """As a terminal cost."""
+        return ca.SX(0)
+
+
+def reverse_osmosis(soft: Penalty | None = None) -> MPC:
+    """Pressure in bar, salt in g/L, a product tank in m; pump and brine valve are slow, and the valve has no price."""
+
+    def flows(x: ca.SX, u: ca.SX, p: object) -> ca.SX:
+        product, brine, feed = 0.0012 * (x[0] - 0.75 * x[1]), 8e-4 * u[1] * x[0], 0.001 * u[0]
+        salt = (5.0 * feed - brine * x[1] - 0.02 * product * x[1]) / 1.2
+        return ca.vertcat(20.0 * (feed - product - brine), salt, (product - 0.02) / 6.0)
+
+    def changes(x: ca.SX, u: ca.SX, before: ca.SX, p: object) -> ca.SX:
+        change, most = u - before, ca.DM([1.0, 0.01])
+        return ca.vertcat(change - most, -change - most)
+
+    limits = [
+        Constraint(changes, "rates", uses_previous=True),
+        StateBounds([-INF, -INF, 1.0], [60.0, 32.0, 4.0], "operation", soft or Penalty(20.0)),
+    ]
+    model, low, high = Model(flows, 3, 2, 2.0), [20.0, 0.05], [100.0, 1.0]
+    return MPC(model, Energy(), Energy(), 40, 0.99, low, high, constraints=limits)
+
+
+def _brackish_states(n: int, rng: np.random.Generator) -> Array:
+    return rng.uniform([25.0, 15.0, 1.2, 20.0, 0.05], [40.0, 25.0, 3.5, 60.0, 0.6], size=(n, 5))
+
+
 #: By name. Hard where nothing else is said.
 PROBLEMS = {
     "cart-pole": Problem(cart_pole, _cart_states),
@@ -225,4 +265,5 @@ PROBLEMS = {
     "planar quadrotor": Problem(planar_quadrotor, _quadrotor_states),
     "lane": Problem(lane, _lane_states),
     "quadrotor": Problem(quadrotor_3d, _flying_states),
+    "reverse osmosis, rates": Problem(reverse_osmosis, _brackish_states),
 }
