@@ -18,9 +18,10 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.outputs import Outputs
 from mpcoffline.mpc.scaling import Scaling
 
-from .observer import KalmanObserver, OutputModel, Outputs
+from .observer import KalmanObserver, OutputModel
 from .output_delays import Fit, search_delays
 from .output_episodes import (
     OutputEpisodes,
@@ -122,7 +123,8 @@ def identify_from_outputs(
     Args:
         mpc: Its model is the one to identify.
         log: Transitions whose observations are the outputs, then the signals, if the plant has some.
-        outputs: Which states are measured, or a function of them.
+        outputs: Which states are measured, or a function of them; of two arguments x, u, also of the inputs that acted
+            in the step before (:class:`KalmanObserver`).
         start: Mean of the states where episodes begin, as far as is known, ``(n_states,)``; where an output is a state,
             the log's own mean goes before it. At rest by default.
         start_spread: How far they are from that, standard deviation, ``(n_states,)``: the scale of states that nobody
@@ -340,10 +342,10 @@ def _with_delay(
 
 def _first_start(given: KalmanObserver, data: OutputEpisodes) -> Array:
     """The mean of the starts, of states that are measured as the log has it."""
-    start, outputs = given.start.copy(), data.y[0].mean(axis=0)
-    jacobian = np.asarray(given.function.jacobian()(start, 0).full())
-    for k, row in enumerate(jacobian):
-        if np.count_nonzero(row) == 1 and row.max() == 1.0:
+    h, start, outputs = given.function, given.start.copy(), data.y[0].mean(axis=0)
+    by_states, *_ = h.jacobian().call([start, *(np.zeros(h.numel_in(i)) for i in range(1, h.n_in())), 0])
+    for k, row in enumerate(np.asarray(by_states.full())):
+        if np.count_nonzero(row) == 1 and row.max() == 1.0 and not given.feedthrough[k]:
             start[int(np.argmax(row))] = outputs[k]
     return start
 

@@ -139,12 +139,14 @@ def filtered_outputs(
     theta, Q, variances = every(found.theta), diagonal(found.process), every(found.noise) ** 2
     known = Estimate(every(found.start).copy(), np.tile(np.diag(spread**2), (m * E, 1, 1)))
     likelihood, history, ahead = np.zeros(m), [], []
+    acting = None  # nobody knows what acted before an episode
     for k in range(T + 1):
-        known, evidence = model.corrected_in_turn(known, np.tile(data.y[k], (m, 1)), variances)
+        known, evidence = model.corrected_in_turn(known, np.tile(data.y[k], (m, 1)), variances, acting)
         likelihood += 0.5 * evidence.reshape(m, E).sum(axis=1)
         history.append(known)
         if k < T:
-            known, F = model.ahead(known, np.tile(data.acting[k], (m, 1)), theta, Q)
+            acting = np.tile(data.acting[k], (m, 1))
+            known, F = model.ahead(known, acting, theta, Q)
             ahead.append((known, F))
     return history, likelihood if lead else likelihood[:1], ahead
 
@@ -194,7 +196,7 @@ def missed_ahead(model: OutputModel, data: OutputEpisodes, found: OutputPoint, s
             for k in range(first, first + steps):
                 known = model.ahead(known, part.acting[k], found.theta, np.zeros_like(known.P[0]))[0]
             last = part.y[first + steps]
-            off, change = last - model.seen(known.x), last - part.y[first]
+            off, change = last - model.seen(known.x, part.acting[first + steps - 1]), last - part.y[first]
             both = np.isfinite(off) & np.isfinite(change)
             missed += np.where(both, off**2, 0.0).sum(axis=0)
             moved += np.where(both, change**2, 0.0).sum(axis=0)
