@@ -40,9 +40,9 @@ _ROWS = 2_000  # that parameters are searched on
 _LONGEST = 100  # steps of a stretch there
 _ROWS_A_NUMBER = 3  # that are the least to learn it from
 _STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 40
-_EVALUATIONS = 2_500  # of Newton's method at the end
+_EVALUATIONS = 4_000  # of Newton's method at the end
 _SHORTER = 2.0 ** -np.arange(8)  # what of a step is tried
-_FLAT, _DONE = 1e-9, 1e-3  # of the largest curvature; by how much the logarithm falls at the end
+_FLAT, _DONE = 1e-9, 0.03  # of the largest curvature; by how much the logarithm falls at the end
 _AWAY = 0.7  # standard deviation of the starts, in logarithms or scaled coordinates
 _PROCESS = 0.01  # of the spread of starts: what the model is first taken to miss in a step
 _WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of the priors
@@ -269,7 +269,7 @@ class _Search:
             fresh = curved is None
             if curved is None:
                 curvatures, axes = np.linalg.eigh(self.curvature(v))
-                curved, left = (np.maximum(np.abs(curvatures), _FLAT * np.abs(curvatures).max()), axes), left - 2 * n**2
+                curved, left = (np.maximum(np.abs(curvatures), _FLAT * np.abs(curvatures).max()), axes), left - n**2
             sizes, axes = curved
             ahead, behind = np.split(self.loss(np.vstack([v + steps, v - steps])), 2)
             step = -axes @ (axes.T @ (ahead - behind) / (2.0 * _STEP) / sizes)
@@ -300,17 +300,22 @@ class _Search:
         return np.asarray(done.x), float(done.fun)
 
     def curvature(self, v: Array) -> Array:
-        """The second derivative of the loss there, ``(size, size)``, by differences."""
+        """The second derivative of the loss there, ``(size, size)``, by differences.
+
+        ::
+
+            2 h^2 H_ij = g(i + j) - g(i) - g(j),    g(a) = f(v + h a) - 2 f(v) + f(v - h a)
+        """
         step, n = 10.0 * _STEP, len(v)
-        pairs = [(i, j) for i in range(n) for j in range(i + 1)]
-        e = step * np.eye(n)
-        points = np.array([v + a * e[i] + b * e[j] for i, j in pairs for a in (1, -1) for b in (1, -1)])
+        e, (rows, columns) = step * np.eye(n), np.triu_indices(n, 1)
+        away = np.vstack([np.zeros(n), e, e[rows] + e[columns]])
+        points = np.vstack([v + away, v - away[1:]])
         values = np.concatenate([self.loss(part) for part in np.array_split(points, -(-len(points) // (4 * n)))])
-        second = values.reshape(-1, 4) @ np.array([1.0, -1.0, -1.0, 1.0]) / (4.0 * step**2)
-        found = np.zeros((n, n))
-        for (i, j), value in zip(pairs, second, strict=True):
-            found[i, j] = found[j, i] = value
-        return found
+        ahead, behind = values[: len(away)], np.append(values[0], values[len(away) :])
+        g = ahead + behind - 2.0 * values[0]
+        found = np.diag(g[1 : n + 1])
+        found[rows, columns] = found[columns, rows] = (g[n + 1 :] - g[1 + rows] - g[1 + columns]) / 2.0
+        return np.asarray(found / step**2)
 
 
 def _with_delay(

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
@@ -16,12 +15,12 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.component import numbers
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.numpy_twin import NumpyTwin
 from mpcoffline.mpc.outputs import Outputs, feedthrough, outputs_of
 from mpcoffline.mpc.rest import at_rest
-from mpcoffline.mpc.torch_twin import TorchTwin
 
 _SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
-_MANY = 500  # points, from which on torch, an operation at a time, is faster than CasADi, a point at a time
+_MANY = 50  # points, from which on numpy, an operation at a time, is faster than CasADi, a point at a time
 _AT_WORK = 50  # steps, after which covariances hardly change any more
 _RANDOM_WALK = 1e3  # steps, over which a disturbance of an unbounded input would have come about
 
@@ -158,17 +157,18 @@ class OutputModel:
             acted: As :meth:`corrected` takes it.
         """
         seen, H, y = self._heard(known.x, y, acted)
-        x, P, evidence = known.x, known.P, np.zeros(len(y))
+        before = x = known.x.T  # loops go last: numpy is twice as fast along them as along a few states
+        P, evidence = np.ascontiguousarray(known.P.transpose(1, 2, 0)), np.zeros(len(y))
         for j in range(y.shape[1]):
-            h, heard = H[:, j], np.isfinite(y[:, j])
-            Ph = (P @ h[:, :, None])[:, :, 0]
-            S = np.einsum("bi,bi->b", h, Ph) + variances[:, j]
-            innovation = np.where(heard, y[:, j] - seen[:, j] - np.einsum("bi,bi->b", h, x - known.x), 0.0)
-            gain = np.where(heard, 1.0 / S, 0.0)[:, None] * Ph
-            x = x + gain * innovation[:, None]
-            P = P - gain[:, :, None] * Ph[:, None, :]
+            h, heard = H[:, j].T, np.isfinite(y[:, j])
+            Ph = (P * h).sum(axis=1)
+            S = (h * Ph).sum(axis=0) + variances[:, j]
+            innovation = np.where(heard, y[:, j] - seen[:, j] - (h * (x - before)).sum(axis=0), 0.0)
+            gain = np.where(heard, 1.0 / S, 0.0) * Ph
+            x = x + gain * innovation
+            P = P - gain[:, None] * Ph
             evidence += np.where(heard, innovation**2 / S + np.log(S), 0.0)
-        return Estimate(x, P), evidence
+        return Estimate(x.T, P.transpose(2, 0, 1)), evidence
 
 
 class KalmanObserver:
@@ -342,7 +342,7 @@ class _WithSlopes:
         slopes = ca.densify(ca.jacobian(value, symbols[0]))
         self._function = ca.Function(name, symbols, [ca.densify(value), slopes])
         self._joined = ca.Function(name, symbols, [ca.densify(ca.vertcat(value, ca.vec(slopes)))])
-        self._twin: TorchTwin | None = None
+        self._twin: NumpyTwin | None = None
         self._has_twin = True
 
     def __call__(self, *arguments: Array) -> tuple[Array, Array]:
@@ -350,13 +350,15 @@ class _WithSlopes:
         B, m = len(arguments[0]), self._function.numel_out(0)
         if B >= _MANY and self._has_twin and self._twin is None:
             try:
-                self._twin = TorchTwin(self._joined)
-            except InvalidArgumentError:  # an operation that torch has not
+                self._twin = NumpyTwin(self._joined)
+            except InvalidArgumentError:  # an operation that numpy has not
                 self._has_twin = False
         if B >= _MANY and self._twin is not None:
-            with torch.no_grad():
-                joined = self._twin(*(torch.from_numpy(np.ascontiguousarray(each)) for each in arguments)).numpy()
-            return joined[:, :m].copy(), joined[:, m:].reshape(B, -1, m).swapaxes(1, 2).copy()
+            columns = (
+                each.T if each.ndim > 1 else np.broadcast_to(each[:, None], (len(each), B)) for each in arguments
+            )
+            joined = self._twin(*columns)
+            return joined[:m].T, joined[m:].reshape(-1, m, B).T
         value, slopes = self._function(*(each.T if each.ndim > 1 else each for each in arguments))
         return np.array(value.full().T), np.array(slopes.full().reshape(m, B, -1).swapaxes(0, 1))
 
