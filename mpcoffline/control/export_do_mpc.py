@@ -35,7 +35,7 @@ def export_do_mpc(policy: Acting | str | PathLike[str], folder: str | PathLike[s
         >>> u = controller().make_step(x)
 
     Args:
-        policy: The policy, or the file of one or of a learner; of one that sees outputs, its MPC.
+        policy: The policy, or the file of one or of a learner; of one that sees outputs, its MPC, which takes states.
         folder: Where to write; made if missing. Files of the same names are overwritten.
 
     Returns:

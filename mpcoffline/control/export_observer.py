@@ -15,8 +15,9 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.limits import check_limit
 from mpcoffline.core.text import c_comment
 from mpcoffline.core.types import Array
-from mpcoffline.estimation.observer import KalmanObserver, disturbed_plant
+from mpcoffline.estimation.observer import KalmanObserver, disturbed_outputs, disturbed_plant
 from mpcoffline.mpc import MPC
+from mpcoffline.mpc.outputs import shown
 from mpcoffline.solvers.ddp.codegen import text
 from mpcoffline.solvers.ddp.elimination import value_and_jacobian
 from mpcoffline.solvers.ddp.emission import emit
@@ -95,6 +96,8 @@ def _source(observer: KalmanObserver, mpc: MPC) -> str:
         f"static const int acting[] = {{{', '.join(map(str, layout.acting))}}};",
         f"static const int sources[] = {{{', '.join(map(str, [*layout.memory_sources, 0]))}}};",
         f"static const int input_of[] = {{{', '.join(map(str, [*layout.ages[0], 0]))}}};",
+        "/* Which outputs depend on the inputs of the step before. */",
+        f"static const int of_inputs[] = {{{', '.join(str(int(each)) for each in observer.feedthrough)}}};",
     ]
     parts = ['#include "mpc_observer.h"', text("scalar.h"), _functions(observer, mpc), "\n".join(constants)]
     return "\n\n".join([*parts, resources.files(__package__).joinpath("observer.c").read_text(encoding="utf-8")])
@@ -102,17 +105,16 @@ def _source(observer: KalmanObserver, mpc: MPC) -> str:
 
 def _functions(observer: KalmanObserver, mpc: MPC) -> str:
     """The model with its disturbances, the outputs, and the Jacobians of both, column by column."""
-    n = mpc.layout.n_states
     (z, acting, theta), reached = disturbed_plant(mpc, observer.n_disturbances)
     check_limit("mpc", "operations of a model", ca.n_nodes(reached), limits.COMPILED_NODES, error=InvalidArgumentError)
     value, slope = value_and_jacobian(reached, z, ca.vertcat(acting, theta))
-    seen, seen_slope = value_and_jacobian(observer.function(z[:n]), z, ca.SX.sym("none", 0))
+    seen, seen_slope = value_and_jacobian(disturbed_outputs(observer.function, z, acting), z, acting)
     joined = [
         ca.cse(ca.vertcat(*(ca.vec(ca.densify(each)) for each in pair)))
         for pair in ((value, slope), (seen, seen_slope))
     ]
     return "\n\n".join(
-        [emit("observed_ahead", [z, acting, theta], joined[0]), emit("observed_outputs", [z], joined[1])]
+        [emit("observed_ahead", [z, acting, theta], joined[0]), emit("observed_outputs", [z, acting], joined[1])]
     )
 
 
@@ -157,9 +159,9 @@ def _episode(policy: OutputFeedbackPolicy, x: Array, usual: Array, noise: Array,
     mpc, observer, stats = policy.mpc, policy.observer, policy.solver_stats
     width = np.asarray(mpc.action_high) - np.asarray(mpc.action_low)
     rows: list[list[float]] = []
-    state, rounded, memory = None, None, mpc.layout.filled(mpc.usual_input)
+    state, rounded, memory, acted = None, None, mpc.layout.filled(mpc.usual_input), np.asarray(mpc.usual_input)
     for k in range(len(noise)):
-        y = observer.function(x).full()[:, 0] + noise[k]
+        y = shown(observer.function, x, acted) + noise[k]
         failed = stats.n_failures
         action, state = policy.predict(np.append(y, usual), state)
         other, rounded = policy.predict(np.append(y * rounding[k], usual), rounded)
@@ -169,7 +171,8 @@ def _episode(policy: OutputFeedbackPolicy, x: Array, usual: Array, noise: Array,
         states = policy.estimates(state)[0][0]
         rows.append([float(k == 0), *y.tolist(), *usual.tolist(), *states.tolist(), *action.tolist()])
         z = np.concatenate([x, usual, memory])
-        x = mpc.plant_function(*mpc.layout.split(z, action), mpc.theta).full()[:, 0]
+        x, acted = mpc.layout.split(z, action)
+        x = mpc.plant_function(x, acted, mpc.theta).full()[:, 0]
         memory = mpc.layout.remembered(memory, action)
         if not np.isfinite(x).all():
             break
@@ -186,7 +189,8 @@ _HEADER = """\
  *   mpc_reset(&state);
  *   every @DT@ s:  mpc_observer_step(&mpc_learned_parameters, &observer, &state, measured, u);
  *
- * measured, MPC_N_MEASURED numbers, outputs first; an output that is NAN is not there:
+ * measured, MPC_N_MEASURED numbers, outputs first; an output that is NAN is not there, nor is one that depends on
+ * inputs before any has acted:
 @MEASURED@
  * The estimated states stand in observer.x after each step, the covariance of their errors in observer.P:
  *   @STATES@;

@@ -41,17 +41,18 @@ static void ahead(const double *theta, mpc_observer *o) {
 }
 
 /* With outputs, one after the other, as their errors are independent: K = P H' / (H P H' + r), x = x- + K (y - h(x-)),
- * P = (1 - K H) P (1 - K H)' + K r K'. All are linearised where the first one found the estimate. */
-static void corrected(const double *y, mpc_observer *o) {
+ * P = (1 - K H) P (1 - K H)' + K r K'. All are linearised where the first one found the estimate. Before anything has
+ * acted, those that depend on inputs are not there. */
+static void corrected(const double *y, int acted, mpc_observer *o) {
     double given[MPC_N_OUTPUTS * (1 + N_ESTIMATED)], x[N_ESTIMATED], P[N_ESTIMATED * N_ESTIMATED];
     double Ph[N_ESTIMATED], K[N_ESTIMATED], hT[N_ESTIMATED];
     const double *H = given + MPC_N_OUTPUTS;
-    observed_outputs(o->x, given);
+    observed_outputs(o->x, o->acting, given);
     for (int i = 0; i < N_ESTIMATED; ++i) x[i] = o->x[i];
     for (int i = 0; i < N_ESTIMATED * N_ESTIMATED; ++i) P[i] = o->P[i];
     for (int m = 0; m < MPC_N_OUTPUTS; ++m) {
         double S = noise[m] * noise[m], innovation = y[m] - given[m], rest = 0.0;
-        if (!(fabs(y[m]) < INFINITY)) continue;
+        if (!(fabs(y[m]) < INFINITY) || (of_inputs[m] && !acted)) continue;
         for (int i = 0; i < N_ESTIMATED; ++i) {
             Ph[i] = 0.0;
             for (int j = 0; j < N_ESTIMATED; ++j) Ph[i] += P[i * N_ESTIMATED + j] * H[m + j * MPC_N_OUTPUTS];
@@ -77,16 +78,17 @@ int mpc_observer_step(
     double u[MPC_NU]
 ) {
     double every[MPC_NX + MPC_NU], d[MPC_NU];
-    int answer;
-    if (o->begun) {
+    int answer, acted = o->begun;
+    if (acted) {
         ahead((const double *)parameters, o);
     } else {
         for (int i = 0; i < N_ESTIMATED; ++i) o->x[i] = begin[i];
         for (int i = 0; i < N_ESTIMATED * N_ESTIMATED; ++i) o->P[i] = 0.0;
         for (int i = 0; i < N_ESTIMATED; ++i) o->P[i * (1 + N_ESTIMATED)] = begin_spread[i] * begin_spread[i];
+        for (int i = 0; i < N_ACTING; ++i) o->acting[i] = 0.0;
         o->begun = 1;
     }
-    corrected(measured, o);
+    corrected(measured, acted, o);
     /* Inputs act together with the disturbances of now: what the MPC plans is to act, what is applied is less. */
     for (int a = 0; a < MPC_NU; ++a) d[a] = a < MPC_N_DISTURBANCES ? o->x[N_ESTIMATED - MPC_N_DISTURBANCES + a] : 0.0;
     for (int i = 0; i < MPC_NY; ++i)

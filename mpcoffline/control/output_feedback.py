@@ -34,7 +34,8 @@ class OutputFeedbackPolicy(BasePolicy):
     Observations are the outputs, ``(n_outputs,)``, followed by the plant's signals, if it has some. Estimates and their
     covariances travel in SB3's ``state``, in front of what the MPC itself carries, so that batches, ``evaluate``,
     recorders and ``episode_start`` are used as with :class:`~mpcoffline.MPCPolicy`. Outputs that are NaN are left out
-    of the estimate, as those of a sensor that is slower than the controller.
+    of the estimate, as those of a sensor that is slower than the controller; so are those that depend on inputs, before
+    any has acted.
 
     With disturbances of the inputs (``KalmanObserver(disturbance=)``) the MPC plans what is to act, v, and
     ``u = v - d`` is applied, within the bounds; past inputs that it holds are to act with the disturbance of now, too.
@@ -101,8 +102,8 @@ class OutputFeedbackPolicy(BasePolicy):
         given = checked_observation(observation, self._size, may_lack=self.observer.n_outputs)
         seen, mpc = np.atleast_2d(given), self.policy.mpc
         y, signals = np.split(seen, [self.observer.n_outputs], axis=1)
-        known, inner = self._before(state, episode_start, len(seen))
-        known = self.observer.corrected(known, y)
+        known, acted, inner = self._before(state, episode_start, len(seen))
+        known = self.observer.corrected(known, y, acted)
         full, disturbance = np.hstack([self.observer.states(known), signals]), self.observer.disturbances(known)
         plan, memory = course_from(mpc, inner, episode_start, len(seen))
         if memory is not None:
@@ -121,10 +122,10 @@ class OutputFeedbackPolicy(BasePolicy):
 
     def _before(
         self, state: tuple[NDArray[Any], ...] | None, episode_start: ArrayLike | None, n: int
-    ) -> tuple[Estimate, tuple[NDArray[Any], ...] | None]:
-        """What is known before the outputs of this step, and the MPC's own state."""
+    ) -> tuple[Estimate, Array | None, tuple[NDArray[Any], ...] | None]:
+        """What is known before the outputs of this step, what acted in the one before, and the MPC's own state."""
         if state is None:
-            return self.observer.begin(n), None
+            return self.observer.begin(n), None, None
         m = self.policy.mpc.layout.n_states + self.observer.n_disturbances
         sizes = [(n, m), (n, m, m), (n, len(self.policy.mpc.layout.acting))]
         shapes = [np.shape(each) for each in state[:OWN]]
@@ -132,15 +133,15 @@ class OutputFeedbackPolicy(BasePolicy):
             raise InvalidArgumentError(
                 "state", expected=f"what predict returned for {n} loops, {sizes}", actual=f"arrays of {shapes}"
             )
-        begun = np.isfinite(state[2]).all(axis=1)
-        known = Estimate(*(np.array(each, dtype=np.float64) for each in state[:2]))
+        *parts, acted = (np.array(each, dtype=np.float64) for each in state[:OWN])
+        known, begun = Estimate(*parts), np.asarray(np.isfinite(acted).all(axis=1))
         if begun.any():
-            moved = self.observer.ahead(known, np.where(begun[:, None], state[2], 0.0))
+            moved = self.observer.ahead(known, np.where(begun[:, None], acted, 0.0))
             known.x[begun], known.P[begun] = moved.x[begun], moved.P[begun]
         if episode_start is not None and np.any(episode_start):
             started, fresh = np.broadcast_to(episode_start, (n,)).astype(bool), self.observer.begin(n)
-            known.x[started], known.P[started] = fresh.x[started], fresh.P[started]
-        return known, state[OWN:]
+            known.x[started], known.P[started], acted[started] = fresh.x[started], fresh.P[started], np.nan
+        return known, acted, state[OWN:]
 
     def estimates(self, state: tuple[NDArray[Any], ...]) -> tuple[Array, Array]:
         """The plant's states ``(B, n_states)`` and the disturbances ``(B, nu)`` in what :meth:`predict` returned."""

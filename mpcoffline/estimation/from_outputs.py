@@ -18,9 +18,10 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.outputs import Outputs
 from mpcoffline.mpc.scaling import Scaling
 
-from .observer import KalmanObserver, OutputModel, Outputs
+from .observer import KalmanObserver, OutputModel
 from .output_delays import Fit, search_delays
 from .output_episodes import (
     OutputEpisodes,
@@ -38,10 +39,10 @@ _log = logging.getLogger(__name__)
 _ROWS = 2_000  # that parameters are searched on
 _LONGEST = 100  # steps of a stretch there
 _ROWS_A_NUMBER = 3  # that are the least to learn it from
-_STARTS, _FIRST_ITERATIONS, _ITERATIONS = 3, 10, 40
-_EVALUATIONS = 2_500  # of Newton's method at the end
+_STARTS, _FIRST_ITERATIONS = 3, 10
+_SCORINGS = 100  # steps of Fisher's scoring at the end, at most
 _SHORTER = 2.0 ** -np.arange(8)  # what of a step is tried
-_FLAT, _DONE = 1e-9, 1e-3  # of the largest curvature; by how much the logarithm falls at the end
+_DONE = 0.03  # by how much the logarithm falls at the end
 _AWAY = 0.7  # standard deviation of the starts, in logarithms or scaled coordinates
 _PROCESS = 0.01  # of the spread of starts: what the model is first taken to miss in a step
 _WIDTHS = {"parameters": 2.0, "noise": 3.0, "process": 3.0, "start": 1.0}  # of the priors
@@ -111,8 +112,9 @@ def identify_from_outputs(
 
         sum_k e_k' S_k^-1 e_k + log det S_k   (Ljung, "System Identification", 2nd ed., 1999, section 7.4)
 
-    from several starts, on about 2,000 rows. The states of the table are smoothed with what was found (Rauch, Tung,
-    Striebel), so that :class:`~mpcoffline.OfflineMPCLearner` takes it like any log.
+    from several starts, on about 2,000 rows: by quasi-Newton steps first, then by Fisher's scoring. The states of
+    the table are smoothed with what was found (Rauch, Tung, Striebel), so that
+    :class:`~mpcoffline.OfflineMPCLearner` takes it like any log.
 
     Example:
         >>> found = identify_from_outputs(mpc, log, [0], start_spread=[1.0, 0.5])
@@ -122,7 +124,8 @@ def identify_from_outputs(
     Args:
         mpc: Its model is the one to identify.
         log: Transitions whose observations are the outputs, then the signals, if the plant has some.
-        outputs: Which states are measured, or a function of them.
+        outputs: Which states are measured, or a function of them; of two arguments x, u, also of the inputs that acted
+            in the step before (:class:`KalmanObserver`).
         start: Mean of the states where episodes begin, as far as is known, ``(n_states,)``; where an output is a state,
             the log's own mean goes before it. At rest by default.
         start_spread: How far they are from that, standard deviation, ``(n_states,)``: the scale of states that nobody
@@ -197,8 +200,7 @@ class _Search:
         self._model, self._data, self._spread = model, data, spread
         noise = _first_noise(data)
         self._first = OutputPoint(mpc.theta, noise, np.maximum(_PROCESS * spread, np.finfo(np.float64).tiny), start)
-        states, _, _ = filtered_outputs(model, data, self._first, spread)
-        x = np.stack([states[k].x for k in range(len(states))])
+        x = np.stack([step.known.x for step in filtered_outputs(model, data, self._first, spread)])
         valid = np.arange(len(data.acting))[:, None] < data.lengths
         steps = x[:-1][valid], data.acting[valid][:, : mpc.nu], x[1:][valid]
         scaling = Scaling.of(steps[0], steps[1], log.values().costs, steps[2])
@@ -236,10 +238,30 @@ class _Search:
 
     def loss(self, v: Array) -> Array:
         """Minus the logarithm of the posterior at points ``(m, size)``, ``(m,)``: all are filtered side by side."""
+        loss = 0.5 * np.sum((v / self._widths) ** 2, axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
-            _, likelihood, _ = filtered_outputs(self._model, self._data, self.found(v[:, None, :]), self._spread)
-        prior = 0.5 * np.sum((v / self._widths) ** 2, axis=1)
-        return np.asarray(np.nan_to_num(likelihood + prior, nan=1e12, posinf=1e12))
+            for step in filtered_outputs(self._model, self._data, self.found(v[:, None, :]), self._spread):
+                loss = loss + step.evidence.reshape(len(v), -1).sum(axis=1)
+        return np.asarray(np.nan_to_num(loss, nan=1e12, posinf=1e12))
+
+    def _slopes(self, v: Array) -> tuple[Array, Array]:
+        """The loss's slope at v, and its second derivative as a true model has it on average: Fisher's information.
+
+        ::
+
+            H_ij = sum_k (de/dv_i de/dv_j) / S + (dS/dv_i dS/dv_j) / (2 S^2) + prior,    the derivatives by differences
+        """
+        n = len(v)
+        points = np.vstack([v + _STEP * np.eye(n), v - _STEP * np.eye(n)])
+        slope, H = v / self._widths**2, np.diag(self._widths**-2.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for step in filtered_outputs(self._model, self._data, self.found(points[:, None, :]), self._spread):
+                e, log_S, evidence = (part.reshape(2, n, -1) for part in (step.e, np.log(step.S), step.evidence))
+                slope = slope + (evidence[0] - evidence[1]).sum(axis=1) / (2.0 * _STEP)
+                deviation = np.exp(0.5 * log_S.mean(axis=(0, 1)))
+                de, dS = ((part[0] - part[1]) / (2.0 * _STEP) for part in (e / deviation, log_S))
+                H = H + de @ de.T + 0.5 * dS @ dS.T
+        return slope, H
 
     def _with_slope(self, v: Array) -> tuple[float, Array]:
         steps = _STEP * np.eye(len(v))
@@ -254,34 +276,29 @@ class _Search:
         starts = [np.zeros(size), *(away * rng.standard_normal(size) for _ in range(_STARTS - 1))]
         starts[0][: self.coordinates.size] = self.coordinates.start
         tried = [self.descended(np.clip(v, self._bounds.lb, self._bounds.ub), _FIRST_ITERATIONS) for v in starts]
-        return self.settled(self.descended(min(tried, key=lambda each: each[1])[0], _ITERATIONS)[0])
+        return self.settled(min(tried, key=lambda each: each[1])[0])
 
     def settled(self, v: Array) -> Array:
-        """The minimum near v by Newton's method: along narrow valleys, where parameters are told apart by little.
+        """The minimum near v by Fisher's scoring, also along narrow valleys, where parameters are told apart by little.
 
-        Curvatures count by their size, and are found again where a step had to be shortened.
+        Coordinates at a bound that lead beyond it stay there.
         """
-        value, n = float(self.loss(v[None])[0]), len(v)
-        steps, left, curved = _STEP * np.eye(n), float(_EVALUATIONS), None
-        while left > 0.0:
-            fresh = curved is None
-            if curved is None:
-                curvatures, axes = np.linalg.eigh(self.curvature(v))
-                curved, left = (np.maximum(np.abs(curvatures), _FLAT * np.abs(curvatures).max()), axes), left - 2 * n**2
-            sizes, axes = curved
-            ahead, behind = np.split(self.loss(np.vstack([v + steps, v - steps])), 2)
-            step = -axes @ (axes.T @ (ahead - behind) / (2.0 * _STEP) / sizes)
+        value = float(self.loss(v[None])[0])
+        for _ in range(_SCORINGS):
+            slope, H = self._slopes(v)
+            if not (np.isfinite(slope).all() and np.isfinite(H).all()):
+                break
+            held = ((v <= self._bounds.lb) & (slope > 0.0)) | ((v >= self._bounds.ub) & (slope < 0.0))
+            step = np.zeros_like(v)
+            step[~held] = -np.linalg.solve(H[np.ix_(~held, ~held)], slope[~held])
             points = np.clip(v + _SHORTER[:, None] * step, self._bounds.lb, self._bounds.ub)
-            losses, left = self.loss(points), left - 2 * n - len(points)
+            losses = self.loss(points)
             best = int(np.argmin(losses))
             fallen = value - float(losses[best])
             if fallen > 0.0:
                 v, value = points[best], float(losses[best])
-            done = not fallen > _DONE
-            if done and fresh:
+            if not fallen > _DONE:
                 break
-            if done or best > 0:
-                curved = None
         return v
 
     def on(self, data: OutputEpisodes) -> _Search:
@@ -298,17 +315,22 @@ class _Search:
         return np.asarray(done.x), float(done.fun)
 
     def curvature(self, v: Array) -> Array:
-        """The second derivative of the loss there, ``(size, size)``, by differences."""
+        """The second derivative of the loss there, ``(size, size)``, by differences.
+
+        ::
+
+            2 h^2 H_ij = g(i + j) - g(i) - g(j),    g(a) = f(v + h a) - 2 f(v) + f(v - h a)
+        """
         step, n = 10.0 * _STEP, len(v)
-        pairs = [(i, j) for i in range(n) for j in range(i + 1)]
-        e = step * np.eye(n)
-        points = np.array([v + a * e[i] + b * e[j] for i, j in pairs for a in (1, -1) for b in (1, -1)])
+        e, (rows, columns) = step * np.eye(n), np.triu_indices(n, 1)
+        away = np.vstack([np.zeros(n), e, e[rows] + e[columns]])
+        points = np.vstack([v + away, v - away[1:]])
         values = np.concatenate([self.loss(part) for part in np.array_split(points, -(-len(points) // (4 * n)))])
-        second = values.reshape(-1, 4) @ np.array([1.0, -1.0, -1.0, 1.0]) / (4.0 * step**2)
-        found = np.zeros((n, n))
-        for (i, j), value in zip(pairs, second, strict=True):
-            found[i, j] = found[j, i] = value
-        return found
+        ahead, behind = values[: len(away)], np.append(values[0], values[len(away) :])
+        g = ahead + behind - 2.0 * values[0]
+        found = np.diag(g[1 : n + 1])
+        found[rows, columns] = found[columns, rows] = (g[n + 1 :] - g[1 + rows] - g[1 + columns]) / 2.0
+        return np.asarray(found / step**2)
 
 
 def _with_delay(
@@ -340,10 +362,10 @@ def _with_delay(
 
 def _first_start(given: KalmanObserver, data: OutputEpisodes) -> Array:
     """The mean of the starts, of states that are measured as the log has it."""
-    start, outputs = given.start.copy(), data.y[0].mean(axis=0)
-    jacobian = np.asarray(given.function.jacobian()(start, 0).full())
-    for k, row in enumerate(jacobian):
-        if np.count_nonzero(row) == 1 and row.max() == 1.0:
+    h, start, outputs = given.function, given.start.copy(), data.y[0].mean(axis=0)
+    by_states, *_ = h.jacobian().call([start, *(np.zeros(h.numel_in(i)) for i in range(1, h.n_in())), 0])
+    for k, row in enumerate(np.asarray(by_states.full())):
+        if np.count_nonzero(row) == 1 and row.max() == 1.0 and not given.feedthrough[k]:
             start[int(np.argmax(row))] = outputs[k]
     return start
 

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.text import check_name, check_unit
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.component import numbers
-from mpcoffline.mpc.expressions import traced
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.numpy_twin import NumpyTwin
+from mpcoffline.mpc.outputs import Outputs, feedthrough, outputs_of
 from mpcoffline.mpc.rest import at_rest
-from mpcoffline.mpc.torch_twin import TorchTwin
-
-#: Outputs: which states a sensor shows, or x ``(n_states, 1)`` -> y as a CasADi column or a list.
-Outputs = Sequence[int] | Callable[[ca.SX], Any]
 
 _SHARE = 0.25  # of an input's range: how large a constant disturbance of it is expected to be
-_MANY = 500  # points, from which on torch, an operation at a time, is faster than CasADi, a point at a time
+_MANY = 50  # points, from which on numpy, an operation at a time, is faster than CasADi, a point at a time
 _AT_WORK = 50  # steps, after which covariances hardly change any more
 _RANDOM_WALK = 1e3  # steps, over which a disturbance of an unbounded input would have come about
 
@@ -47,12 +43,23 @@ def disturbed_plant(mpc: MPC, n_disturbances: int) -> tuple[tuple[ca.SX, ca.SX, 
     Returns:
         The symbols z ``(n_states + n_disturbances, 1)``, what acts ``(nu + n_signals, 1)`` and theta; and z+.
     """
-    n, m = mpc.layout.n_states, n_disturbances
-    z, acting = ca.SX.sym("z", n + m), ca.SX.sym("acting", len(mpc.layout.acting))
+    n = mpc.layout.n_states
+    z, acting = ca.SX.sym("z", n + n_disturbances), ca.SX.sym("acting", len(mpc.layout.acting))
     theta = ca.SX.sym("theta", mpc.space.size)
-    loads = z[n:, 0]  # of one state and no load, z[1:] is a row
-    disturbed = acting + ca.vertcat(loads, ca.SX.zeros(acting.numel() - m)) if m else acting
-    return (z, acting, theta), ca.vertcat(mpc.plant_function(z[:n], disturbed, theta), loads)
+    reached = mpc.plant_function(z[:n], _disturbed(z, acting, n), theta)
+    return (z, acting, theta), ca.vertcat(reached, z[n:, 0])  # of one state and no load, z[1:] is a row
+
+
+def disturbed_outputs(h: ca.Function, z: ca.SX, acted: ca.SX) -> ca.SX:
+    """``h(x, u + d)`` for ``z = [x, d]`` and what acted in the step before, ``(nu + n_signals, 1)``."""
+    n = h.numel_in(0)
+    return h(z[:n]) if h.n_in() == 1 else h(z[:n], _disturbed(z, acted, n)[: h.numel_in(1)])
+
+
+def _disturbed(z: ca.SX, acting: ca.SX, n: int) -> ca.SX:
+    """What acts with the disturbances of the first inputs, which follow the n states in z."""
+    m = z.numel() - n
+    return acting + ca.vertcat(z[n:, 0], ca.SX.zeros(acting.numel() - m)) if m else acting
 
 
 class OutputModel:
@@ -64,20 +71,23 @@ class OutputModel:
         n_disturbances: Of the first inputs, those with a disturbance.
 
     Attributes:
-        function: h, x ``(n_states, 1)`` -> y.
+        function: h, x ``(n_states, 1)`` -> y, or x, u ``(nu, 1)`` -> y where outputs depend on inputs.
         n_outputs: Number of outputs.
+        feedthrough: Which of them depend on inputs, ``(n_outputs,)``.
 
     Raises:
         InvalidArgumentError: For outputs that are none of the states, or no expression.
     """
 
     def __init__(self, mpc: MPC, outputs: Outputs, n_disturbances: int = 0) -> None:
-        n = mpc.layout.n_states
-        self.function: ca.Function = _outputs(outputs, n)
+        self.function: ca.Function = outputs_of(outputs, mpc.layout.n_states, mpc.nu)
         self.n_outputs: int = self.function.numel_out(0)
+        self.feedthrough: NDArray[np.bool_] = feedthrough(self.function)
+        self._is_fed, self._n_acting = bool(self.feedthrough.any()), len(mpc.layout.acting)
         (z, acting, theta), ahead = disturbed_plant(mpc, n_disturbances)
         self._ahead = _WithSlopes("ahead", [z, acting, theta], ahead)
-        self._seen = _WithSlopes("seen", [z], self.function(z[:n]))
+        arguments = [z, acting] if self._is_fed else [z]
+        self._seen = _WithSlopes("seen", arguments, disturbed_outputs(self.function, z, acting))
         self._identity = np.eye(z.numel())
 
     def ahead(self, known: Estimate, acting: Array, theta: Array, Q: Array) -> tuple[Estimate, Array]:
@@ -97,19 +107,31 @@ class OutputModel:
             x[failed], F[failed] = known.x[failed], self._identity
         return Estimate(x, F @ known.P @ F.swapaxes(1, 2) + Q), F
 
-    def seen(self, x: Array) -> Array:
-        """Outputs without noise of states ``(B, n)``, ``(B, n_outputs)``."""
-        return self._seen(x)[0]
+    def seen(self, x: Array, acted: Array) -> Array:
+        """Outputs ``(B, n_outputs)`` without noise at states ``(B, n)``, after what :meth:`ahead` is given acted."""
+        return self._seen(x, acted)[0] if self._is_fed else self._seen(x)[0]
 
-    def corrected(self, known: Estimate, y: Array, R: Array) -> Estimate:
+    def _heard(self, x: Array, y: Array, acted: Array | None) -> tuple[Array, Array, Array]:
+        """Outputs of states, their slopes H, and y without what depends on inputs that nobody knows."""
+        if not self._is_fed:
+            return *self._seen(x), y
+        given = np.full((len(x), self._n_acting), np.nan) if acted is None else acted
+        known = np.asarray(np.isfinite(given).all(axis=1))[:, None]
+        y = np.where(known | ~self.feedthrough, y, np.nan)
+        seen, H = self._seen(x, np.where(known, given, 0.0))
+        return seen, np.where(np.isfinite(y)[:, :, None], H, 0.0), y
+
+    def corrected(self, known: Estimate, y: Array, R: Array, acted: Array | None = None) -> Estimate:
         """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there.
 
         Args:
             known: Before them.
             y: The outputs.
             R: Covariance of their noise, ``(n_outputs, n_outputs)`` or ``(B, n_outputs, n_outputs)``.
+            acted: What acted in the step before, as :meth:`ahead` takes it. In rows of NaN, and without it, that is not
+                known: outputs that depend on it are not there.
         """
-        seen, H = self._seen(known.x)
+        seen, H, y = self._heard(known.x, y, acted)
         missing = ~np.isfinite(y)
         innovation = y - seen
         if missing.any():
@@ -121,28 +143,33 @@ class OutputModel:
         P = left @ known.P @ left.swapaxes(1, 2) + gain @ R @ gain.swapaxes(1, 2)
         return Estimate(known.x + (gain @ innovation[:, :, None])[:, :, 0], P)
 
-    def corrected_in_turn(self, known: Estimate, y: Array, variances: Array) -> tuple[Estimate, Array]:
-        """What is known with outputs, and minus twice their log likelihood, ``(B,)``, but for a constant.
+    def corrected_in_turn(
+        self, known: Estimate, y: Array, variances: Array, acted: Array | None = None
+    ) -> tuple[Estimate, Array, Array]:
+        """What is known with outputs, their innovations e and the variances S of these, ``(B, n_outputs)`` both.
 
         One output after the other, which is the same as all at once where their errors are independent, and faster.
+        Minus twice their log likelihood is the sum of ``e^2 / S + log S`` but for a constant: of an output that is not
+        there e is 0 and S is 1.
 
         Args:
             known: Before them.
             y: The outputs, ``(B, n_outputs)``; those that are NaN are not there.
             variances: Of their errors, ``(B, n_outputs)``.
+            acted: As :meth:`corrected` takes it.
         """
-        seen, H = self._seen(known.x)
-        x, P, evidence = known.x, known.P, np.zeros(len(y))
+        seen, H, y = self._heard(known.x, y, acted)
+        before = x = known.x.T  # loops go last: numpy is twice as fast along them as along a few states
+        P, e, S = np.ascontiguousarray(known.P.transpose(1, 2, 0)), np.zeros(y.T.shape), np.ones(y.T.shape)
         for j in range(y.shape[1]):
-            h, heard = H[:, j], np.isfinite(y[:, j])
-            Ph = (P @ h[:, :, None])[:, :, 0]
-            S = np.einsum("bi,bi->b", h, Ph) + variances[:, j]
-            innovation = np.where(heard, y[:, j] - seen[:, j] - np.einsum("bi,bi->b", h, x - known.x), 0.0)
-            gain = np.where(heard, 1.0 / S, 0.0)[:, None] * Ph
-            x = x + gain * innovation[:, None]
-            P = P - gain[:, :, None] * Ph[:, None, :]
-            evidence += np.where(heard, innovation**2 / S + np.log(S), 0.0)
-        return Estimate(x, P), evidence
+            h, heard = H[:, j].T, np.isfinite(y[:, j])
+            Ph = (P * h).sum(axis=1)
+            S[j] = np.where(heard, (h * Ph).sum(axis=0) + variances[:, j], 1.0)
+            e[j] = np.where(heard, y[:, j] - seen[:, j] - (h * (x - before)).sum(axis=0), 0.0)
+            gain = np.where(heard, 1.0 / S[j], 0.0) * Ph
+            x = x + gain * e[j]
+            P = P - gain[:, None] * Ph
+        return Estimate(x.T, P.transpose(2, 0, 1)), e.T, S.T
 
 
 class KalmanObserver:
@@ -156,6 +183,10 @@ class KalmanObserver:
     with d a constant disturbance of the inputs, where one is asked for: then there is no steady offset of the states
     that are measured, though the model's gain be wrong or a load unknown (offset-free MPC: Muske and Badgwell,
     doi:10.1016/S0959-1524(01)00051-8). Disturbances are told apart only where there are at least as many outputs.
+
+    Outputs may depend on inputs, too (an accelerometer, a current): on those that acted in the step that ends when they
+    are measured, ``h(x_k, u_{k-1} + d_k)``, since the next ones are chosen after that. Where nothing is known to have
+    acted, as when an episode begins, such an output is not there.
 
     Args:
         mpc: Has the model.
@@ -173,6 +204,7 @@ class KalmanObserver:
 
     Attributes:
         n_outputs: Number of outputs.
+        feedthrough: Which of them depend on inputs, ``(n_outputs,)``.
 
     Raises:
         InvalidArgumentError: For numbers that are negative, of another size or not finite, outputs that are none of the
@@ -183,6 +215,7 @@ class KalmanObserver:
     n_disturbances: int
     function: ca.Function
     n_outputs: int
+    feedthrough: NDArray[np.bool_]
 
     def __init__(
         self,
@@ -200,6 +233,7 @@ class KalmanObserver:
         self.mpc, self.n_disturbances = mpc, 0 if disturbance is None else mpc.nu
         self._model = OutputModel(mpc, outputs, self.n_disturbances)
         self.function, self.n_outputs, self._theta = self._model.function, self._model.n_outputs, mpc.theta
+        self.feedthrough = self._model.feedthrough
         self.noise: Array = _spreads("noise", noise, self.n_outputs, positive=True)
         self.process: Array = _spreads("process", process, n)
         self.start: Array = at_rest(mpc)[:n] if start is None else _vector("start", start, n)
@@ -249,9 +283,9 @@ class KalmanObserver:
         """
         known = self.begin(len(x))
         known.x[:, : x.shape[1]] = x
-        seen = self._model.seen(known.x)
+        seen = self._model.seen(known.x, acting)
         for _ in range(_AT_WORK):
-            P = self.corrected(known, seen).P
+            P = self.corrected(known, seen, acting).P
             known = Estimate(known.x, self.ahead(Estimate(known.x, P), acting).P)
         return known
 
@@ -266,10 +300,17 @@ class KalmanObserver:
         with np.errstate(over="ignore", invalid="ignore"):  # of a model that runs away
             return _finite(self._model.ahead(known, acting, self._theta, self._Q)[0], known)
 
-    def corrected(self, known: Estimate, y: Array) -> Estimate:
-        """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there."""
+    def corrected(self, known: Estimate, y: Array, acted: Array | None = None) -> Estimate:
+        """What is known with outputs y ``(B, n_outputs)``; those that are NaN are not there.
+
+        Args:
+            known: Before them.
+            y: The outputs.
+            acted: What acted in the step before, as :meth:`ahead` takes it; in rows of NaN, and without it, outputs
+                that depend on inputs are not there.
+        """
         with np.errstate(over="ignore", invalid="ignore"):
-            return _finite(self._model.corrected(known, y, self._R), known)
+            return _finite(self._model.corrected(known, y, self._R, acted), known)
 
     def states(self, known: Estimate) -> Array:
         """The plant's states, ``(B, n_states)``."""
@@ -289,18 +330,6 @@ def _finite(found: Estimate, before: Estimate) -> Estimate:
     return found
 
 
-def _outputs(outputs: Outputs, n: int) -> ca.Function:
-    x = ca.SX.sym("x", n)
-    if callable(outputs):
-        given = outputs(x)
-        y = ca.SX(ca.vertcat(*given) if isinstance(given, (list, tuple)) else given)
-        return traced("outputs", ca.Function("outputs", [x], [ca.densify(y)]))
-    places = list(outputs)
-    if not places or not all(isinstance(i, (int, np.integer)) and 0 <= i < n for i in places):
-        raise InvalidArgumentError("outputs", expected=f"places of states, 0 to {n - 1}", actual=str(places))
-    return ca.Function("outputs", [x], [x[[int(i) for i in places]]])
-
-
 class _WithSlopes:
     """A function of columns and its Jacobian by the first of them, at many points.
 
@@ -314,7 +343,7 @@ class _WithSlopes:
         slopes = ca.densify(ca.jacobian(value, symbols[0]))
         self._function = ca.Function(name, symbols, [ca.densify(value), slopes])
         self._joined = ca.Function(name, symbols, [ca.densify(ca.vertcat(value, ca.vec(slopes)))])
-        self._twin: TorchTwin | None = None
+        self._twin: NumpyTwin | None = None
         self._has_twin = True
 
     def __call__(self, *arguments: Array) -> tuple[Array, Array]:
@@ -322,13 +351,15 @@ class _WithSlopes:
         B, m = len(arguments[0]), self._function.numel_out(0)
         if B >= _MANY and self._has_twin and self._twin is None:
             try:
-                self._twin = TorchTwin(self._joined)
-            except InvalidArgumentError:  # an operation that torch has not
+                self._twin = NumpyTwin(self._joined)
+            except InvalidArgumentError:  # an operation that numpy has not
                 self._has_twin = False
         if B >= _MANY and self._twin is not None:
-            with torch.no_grad():
-                joined = self._twin(*(torch.from_numpy(np.ascontiguousarray(each)) for each in arguments)).numpy()
-            return joined[:, :m].copy(), joined[:, m:].reshape(B, -1, m).swapaxes(1, 2).copy()
+            columns = (
+                each.T if each.ndim > 1 else np.broadcast_to(each[:, None], (len(each), B)) for each in arguments
+            )
+            joined = self._twin(*columns)
+            return joined[:m].T, joined[m:].reshape(-1, m, B).T
         value, slopes = self._function(*(each.T if each.ndim > 1 else each for each in arguments))
         return np.array(value.full().T), np.array(slopes.full().reshape(m, B, -1).swapaxes(0, 1))
 

@@ -117,13 +117,31 @@ def output_episodes(mpc: MPC, log: TransitionTable, n_outputs: int, *, held: boo
     return OutputEpisodes(y, acting, np.asarray(lengths, dtype=np.intp), np.asarray(firsts, dtype=np.intp))
 
 
-def filtered_outputs(
-    model: OutputModel, data: OutputEpisodes, found: OutputPoint, spread: Array
-) -> tuple[list[Estimate], Array, list[tuple[Estimate, Array]]]:
-    """The filter over all stretches: estimates at each step, minus the log likelihood, predictions with their F.
+class Filtered(NamedTuple):
+    """A step of the filter over all stretches, a row for each: with m points, all stretches of each in turn.
 
-    Points ``(m, 1, size)`` in place of one are filtered side by side; then the likelihood is ``(m,)``.
+    Attributes:
+        known: With the outputs of the step.
+        e: Innovations, ``(rows, n_outputs)``, 0 of outputs that are not there.
+        S: Their variances, 1 of these.
+        predicted: Before the outputs of the next step; in the last one what is known.
+        F: The slopes of that, ``(rows, n, n)``; in the last one those of the step before.
     """
+
+    known: Estimate
+    e: Array
+    S: Array
+    predicted: Estimate
+    F: Array
+
+    @property
+    def evidence(self) -> Array:
+        """Minus the log likelihood, ``(rows,)``, but for a constant."""
+        return np.asarray(0.5 * (self.e**2 / self.S + np.log(self.S)).sum(axis=1))
+
+
+def filtered_outputs(model: OutputModel, data: OutputEpisodes, found: OutputPoint, spread: Array) -> Iterator[Filtered]:
+    """The filter over all stretches, step by step; points ``(m, 1, size)`` in place of one go side by side."""
     T, E = data.acting.shape[:2]
     lead = found.theta.shape[:-2]
     m = int(np.prod(lead)) if lead else 1
@@ -138,15 +156,14 @@ def filtered_outputs(
 
     theta, Q, variances = every(found.theta), diagonal(found.process), every(found.noise) ** 2
     known = Estimate(every(found.start).copy(), np.tile(np.diag(spread**2), (m * E, 1, 1)))
-    likelihood, history, ahead = np.zeros(m), [], []
+    acting, F = None, Q  # nobody knows what acted before an episode
     for k in range(T + 1):
-        known, evidence = model.corrected_in_turn(known, np.tile(data.y[k], (m, 1)), variances)
-        likelihood += 0.5 * evidence.reshape(m, E).sum(axis=1)
-        history.append(known)
+        here, e, S = model.corrected_in_turn(known, np.tile(data.y[k], (m, 1)), variances, acting)
+        known = here
         if k < T:
-            known, F = model.ahead(known, np.tile(data.acting[k], (m, 1)), theta, Q)
-            ahead.append((known, F))
-    return history, likelihood if lead else likelihood[:1], ahead
+            acting = np.tile(data.acting[k], (m, 1))
+            known, F = model.ahead(here, acting, theta, Q)
+        yield Filtered(here, e, S, known, F)
 
 
 def smoothed_states(
@@ -159,18 +176,17 @@ def smoothed_states(
     states: list[Array] = []
     left, without, Q = np.zeros(len(spread)), np.zeros(len(spread)), np.diag(found.process**2)
     for part in _parts(data):
-        history, _, ahead = filtered_outputs(model, part, found, spread)
+        steps = list(filtered_outputs(model, part, found, spread))
         blind = np.tile(np.diag(spread**2), (len(part.lengths), 1, 1))
-        for k, known in enumerate(history):
+        for k, step in enumerate(steps):
             late = (k <= part.lengths) & (2 * k >= part.lengths)
-            left += np.einsum("bii->bi", known.P)[late].sum(axis=0)
+            left += np.einsum("bii->bi", step.known.P)[late].sum(axis=0)
             without += np.einsum("bii->bi", blind)[late].sum(axis=0)
-            if k < len(ahead):
-                blind = ahead[k][1] @ blind @ ahead[k][1].swapaxes(1, 2) + Q
-        x = [known.x for known in history]
+            blind = step.F @ blind @ step.F.swapaxes(1, 2) + Q
+        x = [step.known.x for step in steps]
         for k in range(len(part.acting) - 1, -1, -1):
-            predicted, F = ahead[k]
-            gain = np.linalg.solve(predicted.P + _ridge(predicted.P), F @ history[k].P).swapaxes(1, 2)
+            known, _, _, predicted, F = steps[k]
+            gain = np.linalg.solve(predicted.P + _ridge(predicted.P), F @ known.P).swapaxes(1, 2)
             going = (k < part.lengths)[:, None]
             x[k] = x[k] + np.where(going, (gain @ (x[k + 1] - predicted.x)[:, :, None])[:, :, 0], 0.0)
         whole = np.stack(x)
@@ -188,13 +204,13 @@ def missed_ahead(model: OutputModel, data: OutputEpisodes, found: OutputPoint, s
     n = data.y.shape[2]
     missed, moved, count = np.zeros(n), np.zeros(n), np.zeros(n)
     for part in _parts(data):
-        history = filtered_outputs(model, part, found, spread)[0]
+        history = [step.known for step in filtered_outputs(model, part, found, spread)]
         for first in range(0, len(part.acting) - steps + 1, steps):
             known = history[first]
             for k in range(first, first + steps):
                 known = model.ahead(known, part.acting[k], found.theta, np.zeros_like(known.P[0]))[0]
             last = part.y[first + steps]
-            off, change = last - model.seen(known.x), last - part.y[first]
+            off, change = last - model.seen(known.x, part.acting[first + steps - 1]), last - part.y[first]
             both = np.isfinite(off) & np.isfinite(change)
             missed += np.where(both, off**2, 0.0).sum(axis=0)
             moved += np.where(both, change**2, 0.0).sum(axis=0)

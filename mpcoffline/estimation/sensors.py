@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.expressions import function_from_json, function_to_json
+from mpcoffline.mpc.expressions import function_to_json
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.outputs import outputs_from_json
 
 from .observer import KalmanObserver
 from .plant import state_rows
@@ -27,7 +28,8 @@ class Sensors:
     """Outputs of a plant, and all that an observer needs beside an MPC.
 
     Attributes:
-        outputs: h, states ``(n_states, 1)`` -> outputs.
+        outputs: h, states ``(n_states, 1)`` -> outputs; with the inputs that acted in the step before, ``(nu, 1)``, as
+            a second argument where some depend on these.
         noise: Standard deviation of the error of each output, ``(n_outputs,)``.
         process: Standard deviation of what the model misses of each state in a step, ``(n_states,)``.
         start: Mean of the states where episodes begin, ``(n_states,)``.
@@ -82,11 +84,6 @@ class Sensors:
         missed = np.sqrt(np.mean((s_next - ahead)[:, :n] ** 2, axis=0))
         return replace(self, process=np.fmax(self.process, np.where(np.isfinite(missed), missed, 0.0)))
 
-    def seen(self, states: Array) -> Array:
-        """Outputs without noise at states ``(..., n_states)``, ``(..., n_outputs)``."""
-        flat = self.outputs(states.reshape(-1, states.shape[-1]).T).full().T
-        return np.asarray(flat.reshape(*states.shape[:-1], self.n_outputs))
-
     def to_json(self) -> dict[str, Any]:
         """For a file.
 
@@ -106,9 +103,9 @@ class Sensors:
         Raises:
             InvalidArgumentError: For numbers that are no observer's.
         """
-        known, n = dict(data), mpc.layout.n_states
+        known = dict(data)
         outputs, undetermined = known.pop("outputs"), tuple(str(name) for name in known.pop("undetermined", ()))
-        observer = KalmanObserver(mpc, function_from_json(outputs, "outputs", inputs=(n,)), **known)
+        observer = KalmanObserver(mpc, outputs_from_json(outputs, mpc.layout.n_states, mpc.nu), **known)
         return replace(cls.of(observer), undetermined=undetermined)
 
     def __str__(self) -> str:

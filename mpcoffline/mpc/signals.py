@@ -179,6 +179,11 @@ class Named:
 
 def takes_signals(function: Callable[..., Any], count: int = 4) -> bool:
     """Whether a function of the user takes signals as its last of so many arguments, ``(x, u, p, d)``."""
+    return takes(function, count)
+
+
+def takes(function: Callable[..., Any], count: int) -> bool:
+    """Whether a function of the user takes so many arguments, or more."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # of what is built in

@@ -73,7 +73,7 @@ class Plant:
         changes: With weights, what squares of changes of inputs from step to step cost; nothing by default.
         limits: What the controller has to keep besides the bounds and rates of inputs; nothing by default.
         outputs: What is measured in place of all states: names of these, and :class:`~mpcoffline.Output` with functions
-            of them. Logs and environments hold outputs then; :meth:`identify` estimates the states.
+            of them, and of inputs. Logs and environments hold outputs then; :meth:`identify` estimates the states.
         columns: What logs call what is measured, inputs and signals where that is not their name: headers, or their
             first words as ``{"h1": "LI-101"}``.
         discrete: Whether ``dynamics`` gives the next state.
@@ -239,7 +239,7 @@ class Plant:
 
     @cached_property
     def outputs_function(self) -> ca.Function:
-        """What sensors show of the states as CasADi function ``x -> y``, without noise."""
+        """What sensors show without noise, a CasADi function ``x -> y``, or ``(x, u) -> y`` if it depends on inputs."""
         return outputs_function(self)
 
     def costs(self, x: Array, u: Array, d: Array, before: Array) -> Array:

@@ -16,6 +16,7 @@ from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import InvalidArgumentError, UnknownIdError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import Signal
+from mpcoffline.mpc.outputs import shown
 from mpcoffline.mpc.signals import turned
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     * States begin uniformly in ``starts`` of each :class:`~mpcoffline.State`, and stay within the range of the state.
     * A signal with a range takes uniform values of it, each held for 50 steps on average; one without stays ``usual``.
       A clock begins anywhere. ``signals`` says otherwise.
-    * Inputs act late where the description says so, and change no faster than it says.
+    * Inputs act late where the description says so, and change no faster than it says. Before an episode they are at
+      rest: their ``usual`` value, or zero.
 
     ``reset(options=...)`` knows ``{"state": x}`` and ``{"parameters": {name: value}}``.
 
@@ -124,6 +126,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._x, self._k = np.clip(x, *self._range), 0
         self._signals = [_Signal(s, self._courses.get(s.name), rng, self.plant.steps) for s in self.plant.signals]
         rest = np.array([each.at_rest for each in self.plant.inputs])
+        self._acted: Array = rest  # in the step before, dead time past
         self._past = deque([rest], maxlen=1 + max(each.delay or 0 for each in self.plant.inputs))
         return self._observed(), {"cost": 0.0, "state": self._x.copy(), "applied": rest, "parameters": drawn}
 
@@ -147,8 +150,8 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         cost = float(self.plant.costs(self._x[None], applied[None], present[None], before[None])[0])
         self._past.append(applied)
         late = [each.delay or 0 for each in self.plant.inputs]
-        acting = [self._past[max(-1 - d, -len(self._past))][i] for i, d in enumerate(late)]
-        reached = self._model.plant(self._x, np.append(acting, present), self._theta).full().ravel()
+        self._acted = np.array([self._past[max(-1 - d, -len(self._past))][i] for i, d in enumerate(late)])
+        reached = self._model.plant(self._x, np.append(self._acted, present), self._theta).full().ravel()
         self._x = np.clip(np.where(np.isfinite(reached), reached, self._x), *self._range)
         self._k += 1
         info = {"cost": cost, "state": self._x.copy(), "applied": applied}
@@ -157,7 +160,7 @@ class PlantEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _observed(self) -> NDArray[np.float32]:
         exact: Any = self._x
         if self.plant.outputs:
-            exact = self.plant.outputs_function(exact).full().ravel()
+            exact = shown(self.plant.outputs_function, exact, self._acted)
         measured = exact + self._deviation * self.np_random.standard_normal(len(exact))
         values = np.concatenate([measured, *(signal.now(self._k) for signal in self._signals)]).astype(np.float32)
         return np.clip(values, *self._shown)

@@ -17,6 +17,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.expressions import function_from_json, function_to_json
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.outputs import output_function, outputs_from_json
 
 from .calling import called, number
 from .quantities import State, check_quantity
@@ -33,10 +34,16 @@ class Output:
 
     Example:
         >>> Output("pressure", lambda x: 0.0981 * x.level + 1.0, "bar", low=0.0, noise=0.01)
+        >>> Output("acceleration", lambda x, u: 0.5 * u.force - 0.2 * x.speed, "m/s^2", noise=0.05)
+
+    A sensor is read before the next input is chosen: ``u`` are the inputs that acted in the step that ends there, dead
+    time past. Where an episode begins nobody knows these, so that such an output is not used there; simulations take
+    the inputs to have been at rest.
 
     Args:
         name: What logs call it: a Python identifier.
-        of: A function of the states ``x``; or the name of one, its own by default.
+        of: A function of the states ``x``, and of the inputs ``u`` where it depends on these; or the name of a state,
+            its own by default.
         unit: Its unit.
         low: The least that the sensor gives.
         high: The largest.
@@ -57,7 +64,7 @@ class Output:
         check_quantity("output", self)
         of: object = self.of
         if not (of is None or isinstance(of, str) or callable(of)):
-            expected = "a function of x, or the name of a state"
+            expected = "a function of x and u, or the name of a state"
             raise InvalidArgumentError(f"output {self.name}: of", expected=expected, actual=repr(of)[:200])
         if self.noise is not None:
             check_number(f"output {self.name}: noise", self.noise, 0.0, open_low=False)
@@ -85,7 +92,9 @@ def checked_outputs(plant: Plant, given: object) -> tuple[Output, ...]:
             raise _unknown("outputs", str(output), states)
         output = output if output.of is not None else replace(output, of=output.name)
         if isinstance(output.of, str) and output.of not in states:
-            raise _unknown(f"output {output.name}: of", output.of, states)
+            of, is_input = output.of, output.of in plant.names("inputs")
+            hint = f"Of an input, as it acted: lambda x, u: u.{of}." if is_input else ""
+            raise _unknown(f"output {output.name}: of", of, states, hint)
         found.append(output)
     names = [q.name for q in found]
     taken = names + plant.names("inputs") + plant.names("signals")
@@ -99,24 +108,24 @@ def _of_state(state: State) -> Output:
     return Output(state.name, state.name, state.unit, state.low, state.high, state.deviation)
 
 
-def _unknown(what: str, given: str, states: Mapping[str, State]) -> InvalidArgumentError:
+def _unknown(what: str, given: str, states: Mapping[str, State], hint: str = "") -> InvalidArgumentError:
     error = UnknownIdError.of(what, given, list(states))
-    return InvalidArgumentError(what, expected=error.expected, actual=error.actual, hint=error.hint)
+    return InvalidArgumentError(what, expected=error.expected, actual=error.actual, hint=hint or error.hint)
 
 
 def outputs_function(plant: Plant) -> ca.Function:
-    """What sensors show of the states ``(nx, 1)``, without noise, as a column."""
-    x = ca.SX.sym("x", len(plant.states))
+    """What sensors show of states ``(nx, 1)``, and inputs ``(nu, 1)`` where some depend on these, as a column."""
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     values, names = ca.vertsplit(x), plant.names("states")
     rows = []
     for output in plant.outputs:
         of = output.of
         if callable(of):
             what = f"output {output.name}"
-            rows.append(number(what, called(what, of, plant.values(values))))
+            rows.append(number(what, called(what, of, plant.values(values, ca.vertsplit(u)))))
         else:
             rows.append(values[names.index(of or output.name)])
-    return ca.Function("outputs", [x], [ca.densify(ca.vertcat(*rows))])
+    return output_function(x, u, ca.vertcat(*rows))
 
 
 def identified(plant: Plant, log: TransitionTable, seed: int) -> OutputIdentification:
@@ -132,7 +141,7 @@ class OutputReader:
     """How a log of outputs becomes one of states: all that it takes of a plant, as a file has it, too.
 
     Attributes:
-        outputs: h, states ``(n_states, 1)`` -> outputs.
+        outputs: h, states ``(n_states, 1)`` -> outputs, with the inputs of the step before where some depend on these.
         cost: Of a step: states, inputs, present signals and the inputs before -> cost.
         labels: What the outputs are called, ``(n_outputs,)``.
         starts: Between which values states are where an episode begins, ``(n_states, 2)``.
@@ -230,7 +239,7 @@ class OutputReader:
         if (len(starts), len(places), len(late)) != (n, n, nu):
             sizes = f"{len(starts)} starts, {len(places)} places, {len(late)} inputs"
             raise FileFormatError("outputs", expected=f"those of {n} states and {nu} inputs", actual=sizes)
-        outputs = function_from_json(data["outputs"], "outputs", inputs=(n,), output=len(labels))
+        outputs = outputs_from_json(data["outputs"], n, nu, len(labels))
         cost = function_from_json(data["cost"], "cost", inputs=(n, nu, len(layout.signals), nu), output=1)
         return cls(outputs, cost, labels, starts, places, late)
 

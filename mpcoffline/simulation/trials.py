@@ -18,6 +18,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.sensors import Sensors
 from mpcoffline.mpc.layout import Layout
+from mpcoffline.mpc.outputs import shown
 from mpcoffline.solvers import Plan
 
 from .logged_cost import LoggedCost
@@ -308,22 +309,23 @@ class Surroundings:
             kept: Of how many of them, the first ones, states and inputs are kept with every model.
         """
         ny, n, m, c = self._layout.ny, self._layout.n_states, len(self.models), len(controllers)
-        begun, signals = self.starts[starts], self.signals[starts]
-        noise, disturbances = self.noise[:, starts], self.disturbances[:, starts]
-        shape = m, c, len(begun)  # a row of states for each
+        begun, signals, noise = self.starts[starts], self.signals[starts], self.noise[:, starts]
+        disturbances, shape = self.disturbances[:, starts], (m, c, len(begun))  # a row of states for each
         x = np.broadcast_to(begun, (*shape, begun.shape[1])).copy()
         lost, over, good = (np.zeros(shape, dtype=bool) for _ in range(3))
         total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
         states_kept, actions_kept = [x[:, :, :kept].copy()], []
+        acted = np.full((*shape, len(self._layout.acting)), np.nan)  # nothing, yet
         courses = [self._course(controller, x[:, i], starts) for i, controller in enumerate(controllers)]
         for k in range(self.n_steps):
             seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
             seen[..., :n] += noise[k]
-            outputs = self._outputs(x, starts, k)
+            outputs = self._outputs(x, acted, starts, k)
             for i, controller in enumerate(controllers):
                 given = outputs if isinstance(controller, OutputFeedbackPolicy) else seen
                 found, courses[i] = controller.predict(given[:, i].reshape(-1, given.shape[-1]), state=courses[i])
                 u[:, i] = np.asarray(found, dtype=np.float64).reshape(m, len(begun), -1)
+            acted = self._layout.split(x, u)[1]
             flat = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
             reached = self.models.step(*(each.reshape(m, -1, each.shape[-1]) for each in (x, u))).reshape(x.shape)
             reached[..., :n] += disturbances[:, None, :, k]
@@ -353,12 +355,13 @@ class Surroundings:
             for i in range(c)
         ]
 
-    def _outputs(self, x: Array, starts: slice, k: int) -> Array:
+    def _outputs(self, x: Array, acted: Array, starts: slice, k: int) -> Array:
         """Outputs with noise and signals of states ``(..., starts, nx)`` in step k; nothing where states are seen."""
         if self.sensors is None:
             return x
         n, ny = self._layout.n_states, self._layout.ny
-        return np.concatenate([self.sensors.seen(x[..., :n]) + self.output_noise[k, starts], x[..., n:ny]], axis=-1)
+        y = shown(self.sensors.outputs, x[..., :n], acted) + self.output_noise[k, starts]
+        return np.concatenate([y, x[..., n:ny]], axis=-1)
 
     def _course(self, controller: Controller, x: Array, starts: slice) -> tuple[NDArray[Any], ...] | None:
         """What a controller knows of the time before, at states ``(models, starts, nx)``.

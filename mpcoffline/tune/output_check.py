@@ -13,6 +13,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import OutputIdentification
 from mpcoffline.estimation.from_outputs import AHEAD, NOTHING, SEEN, missed_of
 from mpcoffline.mpc.labels import Label
+from mpcoffline.mpc.outputs import shown
 from mpcoffline.plants import Plant
 
 from .covered import coverage, gain, goal, quiet, readable, sampling
@@ -74,8 +75,12 @@ def _beginnings(plant: Plant, table: TransitionTable, found: LogCheck) -> None:
     """Whether outputs begin where the described starts of the states let them."""
     low, high = np.array([state.starts for state in plant.states]).T
     first = table.take(np.sort(table.episodes.firsts)).observations[:, : len(plant.outputs)]
-    starts = np.random.default_rng(0).uniform(low, high, (200, len(low)))
-    begun = plant.outputs_function(starts.T).full()
+    rng, (least, most) = np.random.default_rng(0), plant.action_bounds
+    starts = rng.uniform(low, high, (200, len(low)))
+    rest = np.array([each.at_rest for each in plant.inputs])
+    bounded = np.isfinite(least) & np.isfinite(most)  # before an episode, any input may have acted
+    acted = rng.uniform(np.where(bounded, least, rest), np.where(bounded, most, rest), (200, len(rest)))
+    begun = shown(plant.outputs_function, starts, acted).T
     for i, output in enumerate(plant.outputs):
         spread = float(np.hypot(begun[i].std(), output.deviation))
         away = abs(float(first[:, i].mean()) - float(begun[i].mean()))

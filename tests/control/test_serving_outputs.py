@@ -20,8 +20,8 @@ from mpcoffline.mpc.labels import Label
 DT = 5.0
 
 
-def plant_of(delay: int = 0) -> Plant:
-    """A slow wall and a room, of which the room is measured, in degrees and by a gauge."""
+def plant_of(delay: int = 0, fed: float = 0.0) -> Plant:
+    """A slow wall and a room, of which the room is measured, in degrees and by a gauge that feels the heater."""
     return Plant(
         "room",
         dt=DT,
@@ -33,7 +33,10 @@ def plant_of(delay: int = 0) -> Plant:
         dynamics=lambda x, u: [0.01 * (x.room - x.wall), 0.01 * (x.wall - 2.0 * x.room + u.power)],
         cost={"room": 1.0, "power": 1e-3},
         references={"room": 25.0},
-        outputs=[Output("room", "room", "K", noise=0.0), Output("gauge", lambda x: x.room**2 / 50.0, "mV", noise=0.0)],
+        outputs=[
+            Output("room", "room", "K", noise=0.0),
+            Output("gauge", lambda x, u: x.room**2 / 50.0 + fed * u.power, "mV", noise=0.0),
+        ],
         horizon=20,
         steps=1_000,
     )
@@ -43,7 +46,7 @@ def policy_of(plant: Plant) -> OutputFeedbackPolicy:
     mpc = plant.mpc()
     labels = [Label(output.name, output.unit) for output in plant.outputs]
     known = {"start": [10.0, 10.0], "start_spread": 5.0, "labels": labels}
-    observer = KalmanObserver(mpc, lambda x: [x[1], x[1] ** 2 / 50.0], [0.1, 0.1], 0.01, **known)
+    observer = KalmanObserver(mpc, plant.outputs_function, [0.1, 0.1], 0.01, **known)
     return OutputFeedbackPolicy(MPCPolicy(mpc), observer)
 
 
@@ -111,10 +114,10 @@ def test_a_sound_loop_does_what_the_policy_does_in_the_environment(delay: int) -
     assert watched.applied == pytest.approx(actions, rel=1e-5, abs=1e-4)
 
 
-@pytest.mark.parametrize("delay", [0, 2])
-def test_it_knows_the_state_through_transfer_silence_and_a_lost_sensor(delay: int) -> None:
+@pytest.mark.parametrize(("delay", "fed"), [(0, 0.0), (2, 0.0), (0, 0.2), (2, 0.2)])
+def test_it_knows_the_state_through_transfer_silence_and_a_lost_sensor(delay: int, fed: float) -> None:
     """An exact model without noise: whatever was applied, the estimate stays where the plant is."""
-    plant = plant_of(delay)
+    plant = plant_of(delay, fed)
     policy = policy_of(plant)
     clock, device, env = lab(policy, plant)
     failing = Failing(device, range(30, 45), {"gauge": range(10, 20), "room": range(22, 27)})

@@ -16,8 +16,10 @@ from mpcoffline import MPC, MPCPolicy, OfflineMPCLearner, TransitionTable, diagn
 from mpcoffline.control import OutputFeedbackPolicy
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.estimation import KalmanObserver, OutputIdentification, identify_from_outputs
+from mpcoffline.estimation.from_outputs import _Search
 from mpcoffline.estimation.observer import OutputModel
 from mpcoffline.estimation.output_episodes import (
+    OutputEpisodes,
     OutputPoint,
     filtered_outputs,
     output_episodes,
@@ -94,8 +96,35 @@ def linear(A: Array, B: Array) -> MPC:
     )
 
 
-def test_of_a_linear_plant_likelihood_and_states_are_those_of_one_normal_distribution() -> None:
-    """All outputs together are normal; given them, the mean of the states is their regression on these."""
+def loss_of(model: OutputModel, data: OutputEpisodes, point: OutputPoint, spread: Array) -> float:
+    """Minus the log likelihood but for a constant, of all points together."""
+    return float(sum(step.evidence.sum() for step in filtered_outputs(model, data, point, spread)))
+
+
+def test_fishers_information_is_the_curvature_where_the_model_is_true() -> None:
+    """On average: near the likeliest point of a log that the model made, to a tenth; its slope is that of the loss."""
+    mpc = mpc_of()
+    log, _ = log_of(mpc, n=30)
+    data, spread = output_episodes(mpc, log, 1), np.array([0.4, 0.4])
+    search = _Search(mpc, OutputModel(mpc, [0]), data.some(1_800, 100, 0), np.zeros(2), spread, log)
+    v = search.settled(np.zeros(search.size))
+    slope, information = search._slopes(v)
+    curvature = search.curvature(v)
+    size = np.sqrt(np.diag(curvature))
+    assert (np.abs(slope) < 0.3 * size).all()  # of standard deviations: what is left to go
+    np.testing.assert_allclose(np.diag(information)[:3], np.diag(curvature)[:3], rtol=0.15)
+    away = v + 0.1 * np.random.default_rng(0).normal(size=len(v))
+    h = 1e-4 * np.eye(len(v))
+    expected = (search.loss(away + h) - search.loss(away - h)) / 2e-4
+    np.testing.assert_allclose(search._slopes(away)[0], expected, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("D", [0.0, 0.7])
+def test_of_a_linear_plant_likelihood_and_states_are_those_of_one_normal_distribution(D: float) -> None:
+    """All outputs together are normal; given them, the mean of the states is their regression on these.
+
+    With D an output is of the input of the step before, too, and the first one, before which there is none, not there.
+    """
     A, B, C = np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([[0.0], [0.1]]), np.array([[1.0, 0.5]])
     mpc, rng, T = linear(A, B), np.random.default_rng(0), 6
     u, y = rng.normal(size=(T, 1)), rng.normal(size=(T + 1, 1))
@@ -110,25 +139,29 @@ def test_of_a_linear_plant_likelihood_and_states_are_those_of_one_normal_distrib
     W = np.diag(np.concatenate([spread**2, np.tile(point.process**2, T)]))
     H = (C @ M).reshape(T + 1, -1)
     S = H @ W @ H.T + 0.3**2 * np.eye(T + 1)
-    missed = y[:, 0] - (c @ C.T)[:, 0]
-    mean = c + (M @ W @ H.T @ np.linalg.solve(S, missed))
+    missed = y[:, 0] - (c @ C.T)[:, 0] - np.append(0.0, D * u[:, 0])
+    there = np.arange(T + 1)[int(D > 0.0) :]
+    W_H, S_there = W @ H[there].T, S[np.ix_(there, there)]
+    mean = c + (M @ W_H @ np.linalg.solve(S_there, missed[there]))
 
     table = TransitionTable.from_arrays(y[:-1], u, np.zeros(T), y[1:], np.zeros(T), np.zeros(T, int))
     data = output_episodes(mpc, table, 1)
     data = data._replace(y=y[:, None])  # tables are float32
     data = data._replace(acting=u[:, None])
-    model = OutputModel(mpc, lambda x: x[0] + 0.5 * x[1])
-    likelihood = filtered_outputs(model, data, point, spread)[1][0]
-    expected = -scipy.stats.multivariate_normal(np.zeros(T + 1), S).logpdf(missed)
-    assert likelihood + 0.5 * (T + 1) * np.log(2.0 * np.pi) == pytest.approx(expected, rel=1e-9)
+    model = OutputModel(mpc, lambda x, u: x[0] + 0.5 * x[1] + D * u[0])
+    likelihood = loss_of(model, data, point, spread)
+    expected = -scipy.stats.multivariate_normal(np.zeros(len(there)), S_there).logpdf(missed[there])
+    assert likelihood + 0.5 * len(there) * np.log(2.0 * np.pi) == pytest.approx(expected, rel=1e-9)
+    several = OutputPoint(*(np.tile(each, (2, 1, 1)) for each in point))
+    np.testing.assert_allclose(loss_of(model, data, several, spread), 2.0 * likelihood)
     states, _ = smoothed_states(model, data, point, spread)
     np.testing.assert_allclose(states[0], mean, atol=1e-8)
     gap = y.copy()
     gap[3] = np.nan  # an output that is not there: the distribution of the others
-    some = np.delete(np.arange(T + 1), 3)
-    likelihood = filtered_outputs(model, data._replace(y=gap[:, None]), point, spread)[1][0]
-    expected = -scipy.stats.multivariate_normal(np.zeros(T), S[np.ix_(some, some)]).logpdf(missed[some])
-    assert likelihood + 0.5 * T * np.log(2.0 * np.pi) == pytest.approx(expected, rel=1e-9)
+    some = there[there != 3]
+    likelihood = loss_of(model, data._replace(y=gap[:, None]), point, spread)
+    expected = -scipy.stats.multivariate_normal(np.zeros(len(some)), S[np.ix_(some, some)]).logpdf(missed[some])
+    assert likelihood + 0.5 * len(some) * np.log(2.0 * np.pi) == pytest.approx(expected, rel=1e-9)
 
 
 class FromAngles(NamedTuple):

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import stable_baselines3.common.env_checker
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from two_tanks import two_tanks
 
-from mpcoffline import InvalidArgumentError, OfflineMPCLearner, Output, Parameter, Plant, State, TransitionTable
+from mpcoffline import (
+    Input,
+    InvalidArgumentError,
+    MPCPolicy,
+    OfflineMPCLearner,
+    Output,
+    Parameter,
+    Plant,
+    State,
+    TransitionTable,
+)
+from mpcoffline.control import OutputFeedbackPolicy
 from mpcoffline.datasets import record
-from mpcoffline.plants.outputs import check_measured
+from mpcoffline.plants.outputs import OutputReader, check_measured
+from mpcoffline.tune import LogCheck
+from mpcoffline.tune.output_check import _beginnings
 
 PRESSURE = Output("pressure", lambda x: 1.0 + 0.0981 * x.h2, "mbar", low=1.0, high=5.0, noise=0.002)
 
@@ -45,6 +61,77 @@ def test_the_environment_shows_outputs() -> None:
     assert np.std(shown) == pytest.approx(0.002, rel=0.2)
     assert info["state"].shape == (2,)
     np.testing.assert_allclose(plant.outputs_function([9.0, 4.0]).full().ravel(), [1.0 + 0.0981 * 4.0])
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_an_output_of_inputs_shows_those_that_acted_just_before(delay: int) -> None:
+    """At rest before the episode, and dead time late."""
+    pump = Input("pump", "V", 0, 6, usual=1.5, delay=delay)
+    current = Output("current", lambda x, u: 0.5 * u.pump - 0.01 * x.h1, "A", noise=0.0)
+    plant = two_tanks(inputs=[pump], outputs=["h2", current])
+    assert plant.outputs_function.n_in() == 2
+    env = plant.env(noise=0.0, spread=0.0)
+    stable_baselines3.common.env_checker.check_env(env)
+    y, info = env.reset(seed=1)
+    applied = [1.5] * (delay + 1)
+    for u in (3.0, 5.0, 2.0, 0.5):
+        assert y[1] == pytest.approx(0.5 * applied[-1 - delay] - 0.01 * info["state"][0], abs=1e-6)
+        y, *_, info = env.step(np.array([u], np.float32))
+        applied.append(u)
+
+
+def test_from_an_output_of_states_and_inputs_a_better_loop_is_learned_than_with_the_rough_model() -> None:
+    """A mass on a spring, of which a load cell between it and its drive is all that is measured; the rough gain is half
+    and the damping three times what they are."""
+
+    def mass(gain: float, damping: float) -> Plant:
+        return Plant(
+            "mass",
+            dt=0.2,
+            states=[State("position", "m", -5, 5, start=(-1, 1)), State("speed", "m/s", -5, 5, start=(-0.5, 0.5))],
+            inputs=[Input("push", "N", -3, 3)],
+            parameters={"gain": Parameter(gain, spread=0.5), "damping": Parameter(damping, spread=0.5)},
+            dynamics=lambda x, u, p: [x.speed, p.gain * u.push - x.position - p.damping * x.speed],
+            cost={"position": 1.0, "push": 0.05},
+            references={"position": 1.0},
+            outputs=[Output("load", lambda x, u: u.push - x.position, "N", noise=0.02)],
+            horizon=15,
+            steps=40,
+        )
+
+    rough, env = mass(0.5, 1.2), mass(1.0, 0.4).env(spread=0.0)
+
+    class Pushes:
+        rng, u, k = np.random.default_rng(0), 0.0, 0
+
+        def predict(self, observation: Any, *others: Any, **more: Any) -> tuple[Any, None]:
+            self.u, self.k = self.rng.uniform(-2.5, 2.5) if self.k % 4 == 0 else self.u, self.k + 1
+            return np.full((*np.shape(observation)[:-1], 1), self.u, np.float32), None
+
+    log = TransitionTable.of(record(env, Pushes(), 6, "hidden/mass-v0", seed=0, overwrite=True))
+    check = LogCheck()
+    _beginnings(rough, log, check)
+    assert not check.remarks
+    found = rough.identify(log)
+    for name, true in (("gain", 1.0), ("damping", 0.4)):
+        i = found.names.index(f"model.{name}")
+        assert abs(float(found.mpc.values[f"model.{name}"]) - true) < 4.0 * found.deviations[i]
+        assert found.deviations[i] < 0.05 * true
+    assert found.sensors.noise[0] == pytest.approx(0.02, rel=0.2)
+    reader, mpc = OutputReader.of(rough), rough.mpc()
+    again = OutputReader.from_json(json.loads(json.dumps(reader.to_json())), mpc)
+    assert again.outputs.n_in() == 2
+    learner = OfflineMPCLearner(mpc, preset="fast", candidate="full", value_n_steps=200)
+    learner.fit(found, show_progress=False)
+
+    def cost(policy: OutputFeedbackPolicy) -> float:
+        return -float(evaluate_policy(policy, Monitor(env), n_eval_episodes=5)[0])
+
+    sensors = found.sensors.suited(mpc, found.table)
+    env.reset(seed=100)
+    learned = cost(learner.output_policy)
+    env.reset(seed=100)
+    assert learned < 0.9 * cost(OutputFeedbackPolicy(MPCPolicy(mpc), sensors.observer(mpc)))
 
 
 def test_names_of_states_stand_for_them() -> None:
@@ -108,6 +195,9 @@ def test_a_log_is_read_by_the_names_of_outputs(tmp_path: Path) -> None:
         ([Output("h1", "h2")], "'h1' twice"),
         (["h2", "h2"], "'h2' twice"),
         ([Output("flow", lambda x: x.h3)], "output flow"),
+        ([Output("current", lambda x, u: u.pumps)], r"output current .*u.pumps: input.*expected one of pump"),
+        ([Output("current", lambda x, v: v)], "expected a function of x, u .*an argument 'v'"),
+        ([Output("current", "pump")], "lambda x, u: u.pump"),
         ([Output("flow", lambda x: [x.h1, x.h2])], "expected a number"),
     ],
 )

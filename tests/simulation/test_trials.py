@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 
 LOG = episodes()
 TRUE_MPC = lq_plant.make_mpc((lq_plant.A, lq_plant.B))
-_X = ca.SX.sym("x", 2)
-TRUE_MPC_OUTPUTS = ca.Function("outputs", [_X], [_X[0] + 2.0 * _X[1]])
+_X, _U = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+OUTPUTS = [_X[0] + 2.0 * _X[1], _X[0] + 2.0 * _X[1] + 0.5 * _U[0]]
 
 
 def place(mpc: MPC, log: TransitionTable, rows: list[int], n_steps: int, members: int = 0) -> Surroundings:
@@ -64,10 +64,12 @@ def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     assert some.states_kept.shape[1] == 0
 
 
-def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller_states() -> None:
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller_states(share: float) -> None:
     """Against a loop of its own: a Kalman filter from where episodes begin, and the same noise for each controller."""
     noise, process, start = np.array([0.3]), np.array([0.05, 0.02]), np.array([1.0, -0.5])
-    sensors = Sensors(TRUE_MPC_OUTPUTS, noise, process, start, np.array([2.0, 2.0]))
+    h = ca.Function("outputs", [_X, _U] if share else [_X], [OUTPUTS[bool(share)]])
+    sensors = Sensors(h, noise, process, start, np.array([2.0, 2.0]))
     rows, n_steps = np.array([0, 30, 60]), 25
     models = LogModels.of(TRUE_MPC, LOG, identify_one_step(TRUE_MPC, LOG), n_perturbed=2, n_residual=0)
     cost = LoggedCost(LOG, seen=2)
@@ -80,8 +82,9 @@ def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller
     for m in range(len(models)):
         x, state, expected = LOG.observations[rows].astype(np.float64), None, np.zeros(3)
         policy = OutputFeedbackPolicy(MPCPolicy(TRUE_MPC), sensors.observer(TRUE_MPC))
+        u = np.full((3, 1), 1e3)  # before the first step: nobody may look at what it would show
         for k in range(n_steps):
-            y = x[:, :1] + 2.0 * x[:, 1:] + around.output_noise[k]
+            y = x[:, :1] + 2.0 * x[:, 1:] + share * u + around.output_noise[k]
             u, state = policy.predict(y, state)
             reached = models.step(np.tile(x, (len(models), 1, 1)), np.tile(u, (len(models), 1, 1)))[m]
             reached += around.disturbances[m, :, k]
