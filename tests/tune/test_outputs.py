@@ -15,6 +15,7 @@ from mpcoffline.learner.presets import PRESETS
 from mpcoffline.tune import Calibration, LogCheck, Tuned, check_log
 
 pytest.importorskip("polars")
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 PLANT = """
 import casadi as ca

@@ -21,6 +21,7 @@ from mpcoffline.diagnostics.trial import TODAY, TRIED, stretched, widening
 from mpcoffline.tune import Calibration, Tuned, retune
 
 pytest.importorskip("polars")
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 LOG = short_episodes(21)
 
