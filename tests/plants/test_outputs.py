@@ -59,8 +59,8 @@ def test_model_and_states_are_found_in_a_log_of_outputs_and_costs_are_theirs() -
     truth = two_tanks(
         states=[State("h1", "cm", 0, 40, start=(2, 20)), State("h2", "cm", 0, 40, start=(2, 20))], outputs=[PRESSURE]
     )
-    env = truth.env(spread=0.0, steps=30)  # steps cost time, episodes do not
-    dataset = record(env, Varied(), 16, "hidden/tanks-v0", seed=0, overwrite=True)
+    env = truth.env(spread=0.0, steps=60)
+    dataset = record(env, Varied(), 8, "hidden/tanks-v0", seed=0, overwrite=True)
     log = TransitionTable.of(dataset)
     assert log.ny == 2
     exact = {name: parameter.value for name, parameter in truth.parameters.items()}
