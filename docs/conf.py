@@ -35,6 +35,7 @@ extensions = [
     "markdown_docstrings",
     "page_meta",
     "results_pages",
+    "several_notebooks",
 ]
 exclude_patterns = ["**/make_*.py"]
 nitpicky = True

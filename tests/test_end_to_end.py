@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 STARTS = {"n_episodes": 8, "seed": 100}
 # The published recipe with shorter schedules, which lose nothing that is asserted here.
-SHORT: dict[str, Any] = {"value_n_steps": 2_000, "fit_n_steps": 300, "fit_batch_size": 256, "refit_rows": 5_000}
+SHORT: dict[str, Any] = {"value_n_steps": 1_500, "fit_n_steps": 150, "fit_batch_size": 256, "refit_rows": 5_000}
 
 
 @pytest.fixture(autouse=True)

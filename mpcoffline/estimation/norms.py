@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -55,8 +56,8 @@ class Norms(NamedTuple):
 
     def __call__(self, x: Array) -> Array:
         """Of x ``(n, d)``, ``(n,)``."""
-        norms = _norms((x - self.mean) / self.spread, self.directions, self.offsets, self.widths)[1]
-        return np.asarray(np.hstack([self.features(x), norms]) @ self.weights)
+        norms = _norms(((x - self.mean) / self.spread).T, self.directions, self.offsets, self.widths)[1]
+        return np.asarray(np.hstack([self.features(x), norms.T]) @ self.weights)
 
     def expression(self, x: ca.SX, least: Array) -> ca.SX:
         """The same as a CasADi scalar in x ``(d, 1)``.
@@ -74,8 +75,8 @@ class Norms(NamedTuple):
 
     def sizes(self, x: Array) -> Array:
         """How large the norms are at x ``(n, d)``: the roots of their mean squares, ``(j,)``."""
-        norms = _norms((x - self.mean) / self.spread, self.directions, self.offsets, self.widths)[1]
-        return np.asarray(np.sqrt(np.mean(norms**2, axis=0)))
+        norms = _norms(((x - self.mean) / self.spread).T, self.directions, self.offsets, self.widths)[1]
+        return np.asarray(np.sqrt(np.mean(norms**2, axis=1)))
 
     @property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -127,7 +128,8 @@ class _Projected:
     """The squared error as a function of what enters nonlinearly, the rest being the best."""
 
     def __init__(self, q: Array, z: Array, y: Array) -> None:
-        self._q, self._z, self._y = q, z, y
+        # Rows in a row of memory each: what is done thousands of times goes along them.
+        self._q, self._z, self._y = (np.ascontiguousarray(each.T) for each in (q, z, y))
         self._gram, self._slope = q.T @ q / len(q), q.T @ y / len(q)
         self._ridge = _RIDGE * float(np.trace(self._gram)) / len(self._gram)
 
@@ -174,32 +176,35 @@ class _Projected:
         return (*parts, self._weights(_norms(self._z, *parts)[1]))
 
     def _parts(self, p: Array) -> tuple[Array, Array, Array]:
-        ends = np.cumsum([int(np.prod(shape)) for shape in self._shapes])[:-1]
-        directions, offsets, widths = (part.reshape(s) for part, s in zip(np.split(p, ends), self._shapes, strict=True))
-        return directions, offsets, widths
+        directions, offsets, widths = self._shapes
+        first, last = math.prod(directions), len(p) - math.prod(widths)
+        return p[:first].reshape(directions), p[first:last].reshape(offsets), p[last:]
 
     def _weights(self, norms: Array) -> Array:
-        n = len(norms)
-        mixed = self._q.T @ norms / n
-        gram = np.block([[self._gram, mixed], [mixed.T, norms.T @ norms / n]])
+        n, m = len(self._y), len(self._q)
+        mixed = self._q @ norms.T / n
+        gram = np.empty((m + len(norms), m + len(norms)))
+        gram[:m, :m], gram[:m, m:], gram[m:, :m], gram[m:, m:] = self._gram, mixed, mixed.T, norms @ norms.T / n
         gram[np.diag_indices_from(gram)] += self._ridge
-        return np.asarray(np.linalg.solve(gram, np.append(self._slope, norms.T @ self._y / n)))
+        return np.asarray(np.linalg.solve(gram, np.append(self._slope, norms @ self._y / n)))
 
     def _error(self, p: Array) -> tuple[float, Array]:
         directions, offsets, widths = self._parts(p)
         v, norms = _norms(self._z, directions, offsets, widths)
         weights = self._weights(norms)
-        missed = self._q @ weights[: self._q.shape[1]] + norms @ weights[self._q.shape[1] :] - self._y
+        m, n = len(self._q), len(self._y)
+        missed = weights[:m] @ self._q + weights[m:] @ norms - self._y
         # At the best weights their own derivatives are zero: only the explicit ones are left.
-        pull = 2.0 / len(missed) * missed[:, None] * weights[self._q.shape[1] :] / norms
-        by_offset = np.einsum("nj,njr->njr", pull, v)
-        by_width = pull.sum(axis=0) * np.exp(2.0 * widths)
-        slopes = np.einsum("njr,nd->jrd", by_offset, self._z), by_offset.sum(axis=0), by_width
-        error = float(np.mean(missed**2)) + self._ridge * float(weights @ weights)
-        return error, np.concatenate([slope.ravel() for slope in slopes])
+        pull = (2.0 / n * weights[m:, None]) * missed / norms
+        by_offset = pull[:, None] * v
+        by_width = pull.sum(axis=1) * np.exp(2.0 * widths)
+        by_direction = by_offset.reshape(-1, n) @ self._z.T
+        error = float(missed @ missed) / n + self._ridge * float(weights @ weights)
+        return error, np.concatenate([by_direction.ravel(), by_offset.sum(axis=2).ravel(), by_width])
 
 
 def _norms(z: Array, directions: Array, offsets: Array, widths: Array) -> tuple[Array, Array]:
-    """``C_j z + d_j`` ``(n, j, r)`` and the norms ``(n, j)``."""
-    v = np.einsum("jrd,nd->njr", directions, z) + offsets
-    return v, np.sqrt(np.square(v).sum(axis=2) + np.exp(2.0 * widths))
+    """Of z ``(d, n)``: ``C_j z + d_j`` ``(j, r, n)`` and the norms ``(j, n)``."""
+    j, r, d = directions.shape
+    v = (directions.reshape(j * r, d) @ z).reshape(j, r, -1) + offsets[:, :, None]
+    return v, np.sqrt(np.square(v).sum(axis=1) + np.exp(2.0 * widths)[:, None])

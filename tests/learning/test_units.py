@@ -22,7 +22,7 @@ from mpcoffline import (
     load_dataset,
     nominal_mpc,
 )
-from mpcoffline.estimation import identify
+from mpcoffline.estimation import identify, small_network
 
 Array = NDArray[np.float64]
 
@@ -34,6 +34,12 @@ QUICK: dict[str, Any] = {
     "fit_batch_size": 64,
 }
 TASKS = {"linear": "LinearTracking-v0", "pendulum": "PendulumSwingUp-v0", "cartpole": "CartPoleSwingUp-v0"}
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small networks of what the model misses are as invariant, and take their time."""
+    monkeypatch.setattr(small_network, "_PATIENCE", 3)
 
 
 def spring_log(n: int = 25, length: int = 40) -> TransitionTable:
@@ -74,7 +80,7 @@ def spring_mpc(hours: float = 1.0, *, start: float = 0.0) -> MPC:
 
 def problem(name: str) -> tuple[MPC, TransitionTable]:
     if name == "spring":
-        return spring_mpc(), spring_log(n=25, length=20)
+        return spring_mpc(), spring_log(n=20, length=15)
     options = {} if name == "linear" else {"alpha": 1.0, "seed": 0}
     table = TransitionTable.of(load_dataset(f"mpcoffline/{name}/ddpg-v0"))
     return nominal_mpc(f"mpcoffline/{TASKS[name]}", **options), table.take(slice(0, 1_000))
@@ -156,7 +162,7 @@ def in_units(units: Units, candidate: str) -> OfflineMPCLearner:
     """What is learned of the spring in other units."""
     schedule = {"value_n_steps": 300, "hidden": (32,), "value_batch_size": 128, "horizon": 15}
     learner = OfflineMPCLearner(units.mpc(spring_mpc()), seed=0, candidate=candidate, **schedule)
-    table = spring_log(n=50, length=20)  # the choice simulates as many steps
+    table = spring_log(n=40, length=15)  # the choice simulates as many steps
     learner.fit(units.table(table), show_progress=False)
     return learner
 

@@ -70,7 +70,7 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_linear_task_mpc_3_is_near_optimal(tmp_path: Path) -> None:
     """On a plant that the model is not of; the bounds are inactive, so that the reference costs what Riccati says."""
-    schedule = {"value_n_steps": 2_000, "fit_n_steps": 400, "fit_batch_size": 256}
+    schedule = {"value_n_steps": 1_000, "fit_n_steps": 200, "fit_batch_size": 256}
     result = run_task("linear", n_episodes=8, output=tmp_path, progress=False, **schedule)
     best, reference = optimum(*plant_matrices(1.0), STATE_WEIGHT, ACTION_WEIGHT, 0.9), result.controller("reference")
     start = np.array(reference.states[0])  # type: ignore[index]

@@ -11,9 +11,11 @@ from typer.testing import CliRunner
 from mpcoffline import TransitionTable, load_plant
 from mpcoffline.cli import app
 from mpcoffline.control import OutputFeedbackPolicy
+from mpcoffline.learner.presets import PRESETS
 from mpcoffline.tune import Calibration, LogCheck, Tuned, check_log
 
 pytest.importorskip("polars")
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 PLANT = """
 import casadi as ca
@@ -38,6 +40,12 @@ plant = Plant(
     steps=40,
 )
 """
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A preset that learns V in a third of its steps."""
+    monkeypatch.setitem(PRESETS, "fast", PRESETS["fast"].replaced({"value_n_steps": 1_000, "polyak": 0.06}))
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +95,10 @@ def test_from_a_log_of_outputs_to_a_policy_on_outputs(files: tuple[Path, Path], 
     assert "there already" in again.output
     before = tuned.table.n_episodes
     trial, truth = tmp_path / "trial.csv", plant.parent / "truth.py"
-    command = ["serve", str(out / "policy.zip"), "--simulate", str(truth), "--log", str(trial), "--periods", "120"]
+    command = ["serve", str(out / "policy.zip"), "--simulate", str(truth), "--log", str(trial), "--periods", "60"]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
-    assert done.output.startswith("120 periods, 120 decided by the policy")
+    assert done.output.startswith("60 periods, 60 decided by the policy")
     done = CliRunner().invoke(app, ["retune", str(out), str(trial)])
     assert done.exit_code == 0, done.output
     assert "outputs of both logs" in done.output

@@ -18,17 +18,17 @@ from mpcoffline.cli import app
 from mpcoffline.datasets.logs.wanted import Wanted
 from mpcoffline.diagnostics import diagnose
 from mpcoffline.diagnostics.trial import TODAY, TRIED, stretched, widening
-from mpcoffline.tune import Calibration, Tuned, retune, tune
+from mpcoffline.tune import Calibration, Tuned, retune
 
 pytest.importorskip("polars")
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 LOG = short_episodes(21)
 
 
-@pytest.fixture(scope="module")
-def tuned(tmp_path_factory: pytest.TempPathFactory) -> Tuned:
-    plant, folder = heater(), tmp_path_factory.mktemp("first") / "tuned"
-    return tune(plant, plant.read(LOG), folder, preset="fast", value_n_steps=60, show_progress=False)
+@pytest.fixture
+def tuned(once: Tuned) -> Tuned:
+    return once
 
 
 @pytest.fixture

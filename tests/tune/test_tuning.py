@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from planted_logs import heater, short_episodes, tanks
+from planted_logs import QUICK, heater, short_episodes, tanks
 from typer.testing import CliRunner
 
 from mpcoffline import FileFormatError, InvalidArgumentError, InvalidDataError, OfflineMPCLearner, StorageError
@@ -19,20 +20,13 @@ from mpcoffline.tune import Tuned, making, tune
 
 pytest.importorskip("polars")
 
-
 LOG = short_episodes(21)
-QUICK: dict[str, Any] = {"preset": "fast", "value_n_steps": 60, "show_progress": False}
 FILES = {"report.html", "policy.zip", "learner.zip", "controller", "log.zip", "plant.json", "run.json"}
 
 
 def tuned_in(folder: Path, log: Any = LOG, **options: Any) -> Tuned:
     plant = heater()
     return tune(plant, plant.read(log), folder / "tuned", **QUICK | options)
-
-
-@pytest.fixture(scope="module")
-def once(tmp_path_factory: pytest.TempPathFactory) -> Tuned:
-    return tuned_in(tmp_path_factory.mktemp("once"))
 
 
 def names(folder: Path) -> set[str]:
@@ -93,9 +87,11 @@ def test_what_was_finished_is_used_again_after_an_interruption(tmp_path: Path, m
     assert names(tmp_path / "tuned") == FILES
 
 
-def test_another_log_starts_anew_and_what_was_there_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    place = tmp_path / "tuned"
-    assert tuned_in(tmp_path).document["policy"] != "MPC_1"
+def test_another_log_starts_anew_and_what_was_there_is_kept(
+    once: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Path(shutil.copytree(once.folder, tmp_path / "tuned"))
+    assert once.document["policy"] != "MPC_1"
     policy = (place / "policy.zip").read_bytes()
     whole = making.diagnose
 
