@@ -56,7 +56,7 @@ class Candidates(Mapping[str, MPC]):
         mpcs: By name: ``"MPC_1"``, ``"full"`` and those between.
         chosen: The one that the learner hands out.
         trials: Their closed loops on models of the log; None where one was taken by name.
-        back_offs: How the limits of the chosen one were made tighter, where that was asked for.
+        back_offs: How the limits of the chosen one were made tighter, where that was asked for, or pays.
         effort: What regressions, choice and search each gain, and how long they took; None where one was taken by name,
             and in what was read from a file.
     """
@@ -258,7 +258,8 @@ def tried(
         variants: Of good ones.
         tell: Is told how many starts of how many are done, and what is tried.
         polish: Whether the best one's weights are moved by what closed loops cost.
-        keep_limits: In which share of its simulated steps the best one is to keep the given limits.
+        keep_limits: In which share of its simulated steps the best one is to keep the given limits; None for as far as
+            that pays.
         ready: What becomes of each before it is tried.
         kept: What an interrupted search over the weights has found, and where more of it is kept.
         learned_in: How long the regressions took, in s of one core.
@@ -285,11 +286,15 @@ def tried(
         seconds["polishing"] = core_seconds() - begun
         steps.append(chosen)
     effort = Effort.of(trials, seconds, steps)
-    tighter = None if keep_limits is None else backed_off(mpcs[chosen], around, keep_limits, tell)
+    tighter: BackOffs | None = backed_off(mpcs[chosen], around, keep_limits, tell)
     if tighter is not None and tighter.mpc is not mpcs[chosen]:
-        chosen += TIGHTER
-        mpcs, trials = {**mpcs, chosen: tighter.mpc}, trials.with_names([chosen])
-        trials.fill({chosen: around.seeing(quick_policy(tighter.mpc))}, around, slice(0, len(trials.rows)))
+        name = chosen + TIGHTER
+        mpcs, trials = {**mpcs, name: tighter.mpc}, trials.with_names([name])
+        trials.fill({name: around.seeing(quick_policy(tighter.mpc))}, around, slice(0, len(trials.rows)))
+        taken = keep_limits is not None or (trials.improves(name) and trials.improves(name, chosen))
+        chosen, tighter = (name, tighter) if taken else (chosen, None)
+    elif keep_limits is None:
+        tighter = None
     found = Candidates(mpcs, chosen, trials, tighter, effort)
     if polish:
         logger.info("%s", effort)

@@ -90,7 +90,8 @@ class OfflineMPCLearner:
             dear. None, the default, leaves hard limits hard.
         keep_limits: In which share of the steps of closed loops on models of the log the given limits are to be kept,
             e.g. 0.95: those of the best candidate are made tighter until they are (chance constraints by back-off);
-            ``findings`` and report say by how much. None leaves them as they are. It needs ``candidate="auto"``.
+            ``findings`` and report say by how much. It needs ``candidate="auto"``. None makes soft limits tighter as
+            far as that is cheaper in these loops, and leaves hard ones as they are.
         method: In place of a preset: a learning method, or the name of one in ``mpcoffline.learning.METHODS``, with its
             own options.
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in

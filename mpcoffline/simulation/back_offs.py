@@ -15,13 +15,15 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Constraint, StateBounds
 
 from .choice import quick_policy
-from .trials import Surroundings
+from .trials import Episodes, Surroundings
 from .violations import TRIFLE, LimitFunction, limit_functions, moved
 
 _ROUNDS = 6
 _FARTHER = 1.2  # times what is missing: the loop follows a tighter limit by less than that
 _LEFT = 0.2  # of the room between two bounds, that is left
 _BETTER = 0.9  # times the violations of the round before, at most: else nothing is gained by more
+_SELDOM = 0.98  # in which share of the steps limits are kept at most, where they are kept as far as that pays
+_SURE = 2.0  # standard errors
 
 logger = logging.getLogger(__name__)
 
@@ -74,9 +76,12 @@ class BackOffs:
 
 
 def backed_off(
-    mpc: MPC, around: Surroundings, share: float, tell: Callable[[int, int, str], None] = lambda *what: None
+    mpc: MPC, around: Surroundings, share: float | None, tell: Callable[[int, int, str], None] = lambda *what: None
 ) -> BackOffs:
     """Tightens limits until closed loops on the models of the log keep the given ones in a share of their steps.
+
+    Or as far as that pays: what is cheapest for an exact model lies at a limit, and what no model knows pushes it over
+    that, at its price, so that a margin may be cheaper.
 
     Round by round: each limit that is violated in too many of the steps, on all models that have a vote together, is
     tightened by what its value lies above zero at the quantile that may not. A loop follows a tighter limit by less
@@ -85,26 +90,30 @@ def backed_off(
     Args:
         mpc: The MPC.
         around: Where it acts; from its usual starts.
-        share: In which the limits are to be kept, e.g. 0.95.
+        share: In which the limits are to be kept, e.g. 0.95; None for as far as that pays: limits without a price stay.
         tell: Is told which round it is.
 
     Returns:
-        The tightest of the rounds that was still better than the one before.
+        The tightest of the rounds that was still better than the one before: it kept limits in more of the steps, or
+        was cheaper, beyond two standard errors on half of the models.
     """
-    limits = list(limit_functions(mpc))
+    limits = [each for each in limit_functions(mpc) if share is not None or each.soft is not None]
     if not limits or not around.models.votes.any():
         return BackOffs(mpc, {}, {}, {})
+    pays, share = share is None, _SELDOM if share is None else share
+    cost: Array = np.zeros((1, 1))
     none = {limit.name: np.zeros(limit.function.size1_out(0)) for limit in limits}
     amounts, best, kept, before = none, (mpc, none), dict[str, float](), dict[str, float]()
     for k in range(_ROUNDS):
         tell(k, _ROUNDS, "limits made tighter")
         tried = _tightened(mpc, amounts)
-        found = {limit.name: _values(limit, mpc, tried, around) for limit in limits}
+        episodes = _acting(tried, around)
+        found = {limit.name: _values(limit, mpc, episodes, around) for limit in limits}
         now = {name: _share(h) for name, h in found.items()}
-        before = before or now
-        if kept and not _missing(now, share) < _BETTER * _missing(kept, share):
+        before, own = before or now, episodes.cost[around.models.votes]
+        if kept and not (_is_cheaper(own, cost) if pays else _missing(now, share) < _BETTER * _missing(kept, share)):
             break
-        best, kept = (tried, amounts), now
+        best, kept, cost = (tried, amounts), now, own
         if _missing(now, share) == 0.0:
             break
         amounts = {n: a if now[n] >= share else a + _more(found[n], share) for n, a in amounts.items()}
@@ -119,9 +128,20 @@ def _missing(kept: Mapping[str, float], share: float) -> float:
     return float(sum(max(share - each, 0.0) for each in kept.values()))
 
 
-def _values(limit: LimitFunction, given: MPC, tried: MPC, around: Surroundings) -> Array:
-    """H of the given limit in the closed loops of another MPC, ``(models, starts, T, n)``."""
+def _acting(tried: MPC, around: Surroundings) -> Episodes:
     (episodes,) = around.act([around.seeing(quick_policy(tried))], slice(0, around.usual), around.usual)
+    return episodes
+
+
+def _is_cheaper(cost: Array, before: Array) -> bool:
+    """Whether episodes ``(models, starts)`` cost less than before, beyond chance, on half of the models."""
+    gain = before - cost
+    error = gain.std(axis=1) / np.sqrt(gain.shape[1])
+    return bool(np.mean(gain.mean(axis=1) > _SURE * error) >= 0.5)
+
+
+def _values(limit: LimitFunction, given: MPC, episodes: Episodes, around: Surroundings) -> Array:
+    """H of the given limit in the closed loops of another MPC, ``(models, starts, T, n)``."""
     votes = around.models.votes
     return limit.along(episodes.states_kept[votes][:, :, :-1], episodes.actions_kept[votes], given.theta)
 

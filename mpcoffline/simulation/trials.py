@@ -46,10 +46,7 @@ class Controller(Protocol):
     """What acts, as :class:`~mpcoffline.control.policy.MPCPolicy` does."""
 
     def predict(self, observation: Any, state: Any = None) -> tuple[NDArray[Any], Any]:
-        """Inputs ``(B, nu)`` for observations ``(B, ny)``, and what the next call wants to know.
-
-        A :class:`~mpcoffline.control.OutputFeedbackPolicy` gets outputs in place of the plant's states.
-        """
+        """Inputs ``(B, nu)`` for observations ``(B, ny)``, or outputs, and what the next call wants to know."""
 
 
 @dataclass(frozen=True)
@@ -132,15 +129,16 @@ class Trials:
         costs = self.second if second else self.cost
         return np.asarray(costs[self.names.index(name)] - costs[0])
 
-    def improves(self, name: str) -> bool:
-        """Whether it costs no more than MPC_1 on the median model, by both regressions.
+    def improves(self, name: str, than: str | None = None) -> bool:
+        """Whether it costs no more than MPC_1, or another, on the median model, by both regressions.
 
         From all starts; those that had no part in the choice may not say otherwise beyond two standard errors.
         Where there is no difference at all, what was identified predicts the log better, and is taken.
         """
         none = _ROUNDING * float(np.abs(self.of(self.names[0])[self.votes]).mean())
         for second in (False, True):
-            gains = self.differences(name, second=second)[self.votes]
+            other = 0.0 if than is None else self.differences(than, second=second)
+            gains = (self.differences(name, second=second) - other)[self.votes]
             middle = int(np.argsort(gains.mean(axis=1), kind="stable")[len(gains) // 2])
             fresh = gains[middle][self.judged]
             error = fresh.std() / np.sqrt(len(fresh)) if len(fresh) else 0.0

@@ -51,10 +51,10 @@ def limited(limit: Any) -> MPC:
     return lq_plant.make_mpc((lq_plant.A, lq_plant.B), **changes)
 
 
-def place(mpc: MPC) -> Surroundings:
+def place(mpc: MPC, priced: MPC | None = None) -> Surroundings:
     models = LogModels.of(mpc, LOG, identify_one_step(mpc, LOG), n_perturbed=1, n_residual=0)
     rows = np.flatnonzero(LOG.observations[:, 0] < 0.1)[:12]
-    return Surroundings(models, LoggedCost(LOG, seen=mpc.ny), LOG, rows, 25, mpc.layout)
+    return Surroundings(models, LoggedCost(LOG, seen=mpc.ny, mpc=priced), LOG, rows, 25, mpc.layout)
 
 
 def kept(mpc: MPC, around: Surroundings) -> float:
@@ -118,3 +118,33 @@ def test_a_learner_hands_them_out(tmp_path: Path) -> None:
     assert again.findings == learner.findings
     with pytest.raises(InvalidArgumentError, match="candidate"):
         OfflineMPCLearner(given, keep_limits=0.95, candidate="full")
+
+
+def test_as_far_as_that_pays() -> None:
+    """Of a dear limit, as pushes make the plant violate it; not of one that costs next to nothing, nor of a hard."""
+
+    def found(price: Penalty | None) -> tuple[MPC, BackOffs, Surroundings]:
+        given = limited([StateBounds([-0.9, -np.inf], [MOST, np.inf], "level", price)])
+        around = place(given, given)
+        return given, backed_off(given, around, None), around
+
+    given, dear, around = found(Penalty(500.0))
+    assert dear.amounts["level"][0] > 0.0
+    before, after = around.act([quick_policy(given), quick_policy(dear.mpc)])
+    votes = around.models.votes
+    assert after.cost[votes].mean() < before.cost[votes].mean()
+    for price in (Penalty(1e-6), None):
+        given, cheap, _ = found(price)
+        assert cheap.mpc is given
+
+
+def test_a_learner_takes_what_pays() -> None:
+    quick: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "given"}
+    given = limited([StateBounds([-0.9, -np.inf], [MOST, np.inf], "level", Penalty(500.0))])
+    learner = OfflineMPCLearner(given, "cost", seed=0, **quick)
+    learner.fit(LOG, show_progress=False)
+    assert learner.candidates is not None
+    trials, chosen = learner.candidates.trials, learner.candidates.chosen
+    assert trials is not None
+    assert chosen.endswith(", backed off")
+    assert trials.improves(chosen, chosen.removesuffix(", backed off"))
