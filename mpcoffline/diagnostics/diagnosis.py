@@ -153,7 +153,8 @@ def diagnose(
     limits = limit_checks(nominal, table, first, second, learned) if nominal.constraints is not None else ()
     if chosen != FIRST:
         judgement = with_limits(judgement, limits)
-    reference = None if getattr(learned.stage_cost, "tracks", None) else learned.reference  # a signal is no fixed one
+    aimed = original.reference is not None  # a learned V has a middle of its own, which is nobody's goal
+    reference = learned.reference if aimed and not getattr(learned.stage_cost, "tracks", None) else None
     report = Report(
         judgement=judgement,
         trials=trials,
@@ -163,7 +164,7 @@ def diagnose(
         value=value_check(learner.value_function, priced, learned.discount),
         fit=fit_errors(nominal, learned, learner.value_function, plain, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
-        theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second),
+        theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second, aimed=aimed),
         weights=weight_checks(nominal, learned, clean),
         at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
@@ -248,13 +249,15 @@ def _theorem(
     value: ValueFunction,
     table: TransitionTable,
     simulation: Episodes,
+    *,
+    aimed: bool,
 ) -> TheoremCheck:
-    """The condition of Theorem 1, along rollouts on the identified model."""
+    """The condition of Theorem 1, along rollouts on the identified model; about a reference, where one was given."""
     states = simulation.states.reshape(-1, learned.nx)
     found = TheoremCheck(
         value_growth(value, table, states, bool(simulation.lost[0].any())), outside_support(table, states), ()
     )
-    if learned.reference is None:
+    if not aimed:
         return found
     rest = settled(learned, table)
     moduli = closed_loop_eigenvalues(learned, policy.solver, table, rest)

@@ -302,7 +302,10 @@ def _checks(report: Report) -> dict[str, list[tuple[str, str]]]:
             ("Predictions outside the data", share(report.outside_support)),
             ("Share of the logged cost that the simulated one explains (R²)", number(report.cost_r2)),
             ("Effect of past inputs, against the present one's", share(report.lag.share)),
-            ("Dead time that the model lacks", "found" if report.lag.found else "none found"),
+            (
+                "Past inputs that the model lacks, as where one acts late or slowly",
+                "found" if report.lag.found else "none found",
+            ),
         ],
         "value": [
             ("V against measured returns", value),

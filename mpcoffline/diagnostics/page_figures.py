@@ -68,7 +68,8 @@ def panels(report: Report) -> dict[str, Picture]:
         ),
         "distances": (
             lambda axes: figure.draw_distances(axes, traces),
-            "Distance to the goal on the identified model, over all starts: median and quartiles.",
+            f"Distance to {'where the loops end' if traces.goal is None else 'the goal'} on the identified model, over"
+            " all starts: median and quartiles.",
         ),
         "value": (
             lambda axes: figure.draw_value(axes, report.value, traces),

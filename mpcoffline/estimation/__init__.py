@@ -7,6 +7,7 @@ from .episodes import EpisodeSpread
 from .from_outputs import OutputIdentification, identify_from_outputs
 from .identification import IdentificationConfig
 from .identifying import Identification, identify
+from .lags import Lag, find_lags
 from .observer import KalmanObserver
 from .profiles import with_profiles
 from .residual import Residual, fit_residual, fit_residuals, with_residual
@@ -21,6 +22,7 @@ __all__ = [
     "Identification",
     "IdentificationConfig",
     "KalmanObserver",
+    "Lag",
     "LinearModel",
     "MultiStepCheck",
     "NoiseEstimate",
@@ -29,6 +31,7 @@ __all__ = [
     "Sensors",
     "estimate_noise",
     "find_delays",
+    "find_lags",
     "fit_residual",
     "fit_residuals",
     "identify",

@@ -92,7 +92,7 @@ def find_delays(mpc: MPC, table: TransitionTable, *, seed: int = 0) -> DelaySear
     """
     table.check_fits(mpc.ny, mpc.nu)
     given = best = mpc.layout.delay
-    scan = _Scan(mpc, excerpt(table, _ROWS, seed), seed)
+    scan = Scan(mpc, excerpt(table, _ROWS, seed), seed)
     visited = [0] * mpc.nu
     if not scan.tells(given):
         return DelaySearch(given, given, 1.0, tuple(visited))
@@ -120,7 +120,7 @@ class _Errors(NamedTuple):
     z: Array
 
 
-class _Scan:
+class Scan:
     """Models identified with one dead time or another, compared on the same held-out rows."""
 
     def __init__(self, mpc: MPC, table: TransitionTable, seed: int) -> None:
@@ -137,7 +137,7 @@ class _Scan:
         typical = lengths[np.searchsorted(np.cumsum(lengths), lengths.sum() / 2)]  # half of the rows are in longer ones
         self._cap = int(typical) // 3
         self._spread = np.where(self._x.std(axis=0) > 0.0, self._x.std(axis=0), 1.0)
-        self._known: dict[tuple[int, ...], _Errors] = {}
+        self._known: dict[tuple[float, ...], _Errors] = {}
         self._problem = OneStepProblem(mpc, Rows(self._x, self._acting(mpc.layout.delay), self._reached))
         missed = self._problem.errors(mpc.theta) * self._problem.scale
         rows, self._angles = without_jumps(self._problem.rows, missed)
@@ -146,7 +146,7 @@ class _Scan:
             self._problem = OneStepProblem(mpc, rows)
         self._z = np.zeros(len(self._problem.free))
 
-    def tells(self, delay: tuple[int, ...]) -> bool:
+    def tells(self, delay: tuple[float, ...]) -> bool:
         """Whether there are enough rows to compare dead times at all."""
         if self._cap < 1 or len(self._x) < _FEWEST:
             return False
@@ -163,12 +163,12 @@ class _Scan:
             if score < lowest:
                 chosen, lowest, end = candidate, score, min(self._cap, max(end, d + _PATIENCE))
             d += 1
-        if chosen == current or not self._better(chosen, current):
+        if chosen == current or not self.better(chosen, current):
             return current, end
         self._z = self.errors(chosen).z
         return chosen, end
 
-    def _promises(self, delay: tuple[int, ...], than: tuple[int, ...]) -> bool:
+    def _promises(self, delay: tuple[float, ...], than: tuple[float, ...]) -> bool:
         """Whether identification with a dead time may pay, as the model linearised about the present parameters says.
 
         Their best values for it are those of a linear regression, without bounds and prior: more than any model gets.
@@ -188,12 +188,12 @@ class _Scan:
             left.append(float(np.sum((errors.ravel() - slopes @ best) ** 2)))
         return left[0] <= _PROMISING**2 * left[1]
 
-    def gain(self, delay: tuple[int, ...], than: tuple[int, ...]) -> float:
+    def gain(self, delay: tuple[float, ...], than: tuple[float, ...]) -> float:
         """The one-step error relative to that with another dead time, on held-out rows that both know."""
         squares, others = self._compared(delay, than)
         return float(np.sqrt(squares.mean() / others.mean()))
 
-    def _compared(self, delay: tuple[int, ...], than: tuple[int, ...]) -> tuple[Array, Array]:
+    def _compared(self, delay: tuple[float, ...], than: tuple[float, ...]) -> tuple[Array, Array]:
         """Mean squares of windows ``(w,)`` of both; each coordinate in units of the error of the second."""
         first, second = self.errors(delay).one, self.errors(than).one
         rows = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1) & self._held_out
@@ -211,14 +211,14 @@ class _Scan:
         window = np.cumsum(self._before % _WINDOW == 0)[rows]
         return np.arange(int(rows.sum())), np.unique(window, return_counts=True)[1]
 
-    def _better(self, delay: tuple[int, ...], than: tuple[int, ...]) -> bool:
+    def better(self, delay: tuple[float, ...], than: tuple[float, ...]) -> bool:
         """Whether a dead time is to be believed rather than another one."""
         squares, others = self._compared(delay, than)
         if not (self.gain(delay, than) <= 1.0 - _LEAST_GAIN and _larger(others, squares)):
             return False
         return self._ahead(delay, than) <= _NO_WORSE * self._ahead(than, delay)
 
-    def errors(self, delay: tuple[int, ...]) -> _Errors:
+    def errors(self, delay: tuple[float, ...]) -> _Errors:
         """The model identified with a dead time, and its errors."""
         if delay not in self._known:
             valid = self._before >= max(delay)
@@ -244,13 +244,13 @@ class _Scan:
         starts = [self._z, np.zeros_like(self._z)] if stuck else [self._z]
         return min((some.descend(z, _PRIOR, iterations) for z in starts), key=attrgetter("cost")).z
 
-    def _acting(self, delay: tuple[int, ...]) -> Array:
+    def _acting(self, delay: tuple[float, ...]) -> Array:
         """The inputs that act in each row, and its signals, ``(n, nu + n_signals)``; anything where not known."""
         rows = np.arange(len(self._u))
-        inputs = np.stack([self._u[np.maximum(rows - d, 0), i] for i, d in enumerate(delay)], axis=1)
+        inputs = np.stack([self._u[np.maximum(rows - int(d), 0), i] for i, d in enumerate(delay)], axis=1)
         return np.hstack([inputs, self._signals])
 
-    def _ahead(self, delay: tuple[int, ...], other: tuple[int, ...]) -> float:
+    def _ahead(self, delay: tuple[float, ...], other: tuple[float, ...]) -> float:
         """Mean square error over 15 steps without correction, in spreads of the states, from where both know enough."""
         last = np.flatnonzero(self._held_out & (self._before >= _WINDOW - 1 + max(*delay, *other)))
         last = last[:: max(1, len(last) // _FEW_ROWS)]

@@ -100,7 +100,10 @@ def checked_outputs(plant: Plant, given: object) -> tuple[Output, ...]:
     taken = names + plant.names("inputs") + plant.names("signals")
     taken += [name for name in states if not any(q.name == q.of == name for q in found)]
     if twice := sorted({name for name in names if taken.count(name) > 1}):
-        raise InvalidArgumentError("outputs", expected="names of their own", actual=f"{twice[0]!r} twice")
+        name = twice[0]
+        shown = f"A state that is measured as it is stands by its name, {name!r}, or as Output({name!r}, ...) without a"
+        hint = f"{shown} function." if name in states and names.count(name) == 1 else ""
+        raise InvalidArgumentError("outputs", expected="names of their own", actual=f"{name!r} twice", hint=hint)
     return tuple(found)
 
 

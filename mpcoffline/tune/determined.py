@@ -97,13 +97,13 @@ def _asked(plant: Plant, wanted: dict[str, Experiment | None]) -> list[str]:
         input_, steps = plant.inputs[i], max(each.steps for each in own.values())
         texts.append(
             f"the log does not determine {listed(list(own))}: move {input_.name} at random between two values"
-            f" {2 * amplitude:.3g} {input_.unit} apart, each kept for {_long(hold * plant.dt)} or longer, for about"
-            f" {_long(max(steps, 4 * hold) * plant.dt)}".replace("  ", " ")
+            f" {2 * amplitude:.3g} {input_.unit} apart, each kept for {in_words(hold * plant.dt)} or longer, for about"
+            f" {in_words(max(steps, 4 * hold) * plant.dt)}".replace("  ", " ")
         )
     return texts
 
 
-def _long(seconds: float) -> str:
+def in_words(seconds: float) -> str:
     """A time in words: ``"0.25 s"``, ``"12 minutes"``, ``"3.4 hours"``."""
     for size, word in ((86_400.0, "days"), (3_600.0, "hours"), (60.0, "minutes")):
         if seconds >= 2.0 * size:

@@ -8,10 +8,11 @@ import numpy as np
 
 from mpcoffline.core.errors import InvalidDataError
 from mpcoffline.core.tables import Table
+from mpcoffline.core.text import figure
 from mpcoffline.core.threads import one_blas_thread
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
-from mpcoffline.estimation import find_delays, identify
+from mpcoffline.estimation import find_delays, find_lags, identify
 from mpcoffline.estimation.consistency import check
 from mpcoffline.estimation.multi_step import Windows, open_loop
 from mpcoffline.estimation.plant import plant_rows
@@ -20,7 +21,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.plants import BlackBoxPlant, Plant
 
 from .covered import coverage, gain, goal, quiet, readable, sampling
-from .determined import parameters
+from .determined import in_words, parameters
 from .output_check import check_outputs
 from .page import Kind, LogCheck
 
@@ -28,6 +29,7 @@ _ROWS = 20_000
 _AHEAD = 10  # steps
 _NOISY = 0.3  # of the increments' spread
 _WELL, _POOR = 0.2, 0.5  # of the spread, ten steps ahead
+_MOVED = 0.1  # of a parameter, where a lag is described
 _TREND, _SURE = 0.05, 5.0  # of the errors' variance, and standard errors
 
 
@@ -80,6 +82,7 @@ def check_log(
         try:
             tell("dead time")
             mpc = _dead_time(plant, mpc, table, found, seed)
+            _lags(plant, mpc, table, found, seed)
             tell("parameters")
             found.identification = identify(mpc, table, seed=seed)
         except InvalidDataError as error:
@@ -124,6 +127,32 @@ def _dead_time(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck, 
             kind: Kind = "advice" if each.delay is None else "problem"
             found.add(kind, "dead time", text)
     return mpc.with_delay(delays.delay)
+
+
+def _lags(plant: Plant, mpc: MPC, table: TransitionTable, found: LogCheck, seed: int) -> None:
+    """What acts slowly where the equations say at once; and what that makes of a parameter that takes its place."""
+    found.lags = find_lags(mpc, table, seed=seed)
+    names = [*(each.name for each in plant.inputs), *(signal.name for signal in mpc.layout.signals)]
+    space = mpc.model.space
+    for lag in found.lags:
+        name, seconds = names[lag.place], lag.steps * mpc.model.dt
+        before, after = lag.before[: space.size], lag.after[: space.size]
+        text = (
+            f"{name} acts slowly, as through a lag with a time constant of about {in_words(seconds)}: with one,"
+            f" one-step errors are {lag.gain:.2g} times those without"
+        )
+        moved = np.abs(after - before) / np.maximum(np.maximum(np.abs(before), np.abs(after)), 1e-300)
+        if space.size and moved.max() > _MOVED:
+            k = int(moved.argmax())
+            text += f", and {space.names[k]} in the log is {after[k]:.3g} instead of {before[k]:.3g}"
+        state = f"slow_{name}"
+        found.add(
+            "advice",
+            "lag",
+            f"{text}. Without it the model is wrong where inputs move otherwise than in the log. Describe a state"
+            f" {state} that follows it at the rate ({name} - {state}) / {figure(seconds, 2)} s, and name in"
+            " outputs=[...] what is measured",
+        )
 
 
 def _noise(plant: Plant, found: LogCheck) -> None:

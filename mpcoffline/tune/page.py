@@ -7,7 +7,7 @@ from typing import Literal
 
 from mpcoffline.core.notebook import html_of
 from mpcoffline.core.tables import Table
-from mpcoffline.estimation import DelaySearch, Identification, OutputIdentification
+from mpcoffline.estimation import DelaySearch, Identification, Lag, OutputIdentification
 
 from .experiment import Experiment
 
@@ -45,6 +45,7 @@ class LogCheck:
         identification: The model of the log; None where none could be found, or outputs are measured.
         outputs: What was found in a log of outputs; None where states are measured.
         delays: What the log says of dead time.
+        lags: Inputs and signals that act slowly where the equations say at once; nothing is looked for in outputs.
         experiments: What would determine the parameters that the log leaves open.
     """
 
@@ -54,6 +55,7 @@ class LogCheck:
     identification: Identification | None = None
     outputs: OutputIdentification | None = None
     delays: DelaySearch | None = None
+    lags: list[Lag] = field(default_factory=list)
     experiments: dict[str, Experiment | None] = field(default_factory=dict)
 
     def add(self, kind: Kind, about: str, text: str, *, forbids: bool = False) -> None:

@@ -132,7 +132,7 @@ class Tuned:
             return (
                 "MPC_1 is new, too: it acts on a linear model of the log. Where it costs clearly less than today's"
                 " controller, above, it is worth a trial under supervision, of which you keep the log:",
-                f"  mpcoffline serve {at}/{POLICY} --log trial.csv",
+                f"  mpcoffline serve {at}/{POLICY} --device HOST:PORT --log trial.csv",
             )
         if self.verdict == KEEP:
             return (
@@ -142,7 +142,7 @@ class Tuned:
         care = ", somebody at the switch from the first step on" if self.verdict == "try with care" else ""
         return (
             f"Read {at}/{PAGE}. Then a trial under supervision{care}, of which you keep the log:",
-            f"  mpcoffline serve {at}/{POLICY} --log trial.csv",
+            f"  mpcoffline serve {at}/{POLICY} --device HOST:PORT --log trial.csv",
             "After it, see whether the plant did as predicted, and learn from that, too:",
             f"  mpcoffline retune {at} trial.csv",
         )

@@ -24,6 +24,8 @@ from .making import Order, Tell, check_options, made
 from .page import LogCheck
 from .tuned import Tuned
 
+_SAID = {"problem": "To be looked at", "advice": "Advice"}
+
 
 def tune(
     plant: Plant | BlackBoxPlant,
@@ -108,8 +110,8 @@ def tune(
     else:
         said = place.once("check", lambda: _said(checked()))
     for each in said["remarks"]:
-        if each["kind"] == "problem":
-            tell(f"To be looked at: {each['about']}: {each['text']}")
+        if each["kind"] != "good":
+            tell(f"{_SAID[each['kind']]}: {each['about']}: {each['text']}")
     order = Order(
         plant.name,
         reader,

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import lq_plant
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOf
 from mpcoffline.diagnostics import Report, diagnose
 from mpcoffline.diagnostics.page import page_of
 from mpcoffline.estimation.smoothing import with_measurement_noise
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, Block, ParameterSpace
+from mpcoffline.mpc.component import Component
 
 LOG = episodes(n=40, steps=40)
 # An engineer who believes that inputs act the other way.
@@ -100,6 +102,34 @@ def test_the_figure_is_drawn(good: Report, tmp_path: Path) -> None:
 
 def test_the_same_seed_gives_the_same_report(good: Report) -> None:
     assert diagnose(fitted(WRONG), LOG, n_starts=8, n_steps=40).to_json() == good.to_json()
+
+
+class Unaimed(Component):
+    """The linear plant's cost, written so that nobody says where it is zero."""
+
+    def __init__(self) -> None:
+        self.space = ParameterSpace([Block.free("scale", np.array(1.0), "cost")])
+
+    def expression(self, x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        return p["scale"] * (x.T @ ca.DM(lq_plant.W) @ x + u.T @ ca.DM(lq_plant.R) @ u)
+
+    def terminal_expression(self, x: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        return p["scale"] * (x.T @ ca.DM(lq_plant.W) @ x)
+
+
+def test_without_a_goal_in_the_description_nothing_is_said_of_one() -> None:
+    """A learned V has a middle of its own, zero where nobody says another: it is no goal of the plant."""
+    learner = fitted(WRONG.replace(stage_cost=Unaimed(), terminal_cost=Unaimed()), terminal="quadratic")
+    assert learner.nominal_mpc.reference is None
+    assert learner.mpc.reference is not None
+    report = diagnose(learner, LOG, n_starts=8, n_steps=40)
+    assert report.traces is not None
+    assert report.traces.goal is None
+    assert report.goal is None
+    assert report.theorem.eigenvalues == ()
+    page = page_of(report)
+    assert "Distance to where the loops end" in page
+    assert "Distance to the goal" not in page
 
 
 def test_where_nothing_can_be_gained_mpc_1_is_kept() -> None:

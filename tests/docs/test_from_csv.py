@@ -33,7 +33,7 @@ def test_its_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     names: dict[str, Any] = {"learner": Learner()}
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     given: list[tuple[Any, ...]] = []  # both have tests of their own, of a minute
 
     def stand_in(*arguments: Any) -> Any:
@@ -49,5 +49,9 @@ def test_its_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert given == [(names["plant"], names["table"], "tuned"), ("tuned", "trial.csv")]
     assert names["stats"].periods + names["stats"].skipped == 5
     assert len(Path("served.csv").read_text().splitlines()) == 1 + names["stats"].periods
+    assert len(Path("tried.csv").read_text().splitlines()) == 1 + 3 * 40
+    tried = names["plant"].read("tried.csv", where={"decided_by": "policy"})
+    assert tried.n_episodes == 3  # of the plant's time: no interval is an average
+    assert "resampled" not in str(tried.report)
     assert names["learner"].rows == 59
     assert names["env"].spec.id == "plants/TwoTanks-v0"

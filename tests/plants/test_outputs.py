@@ -194,6 +194,7 @@ def test_a_log_is_read_by_the_names_of_outputs(tmp_path: Path) -> None:
         ([Output("pump", "h2")], "'pump' twice"),
         ([Output("h1", "h2")], "'h1' twice"),
         (["h2", "h2"], "'h2' twice"),
+        ([Output("h2", lambda x: x.h2)], "'h2' twice.*by its name, 'h2', or as Output"),
         ([Output("flow", lambda x: x.h3)], "output flow"),
         ([Output("current", lambda x, u: u.pumps)], r"output current .*u.pumps: input.*expected one of pump"),
         ([Output("current", lambda x, v: v)], "expected a function of x, u .*an argument 'v'"),

@@ -16,7 +16,7 @@ from mpcoffline.cli.own_plants import _show
 from mpcoffline.core.tables import Table
 from mpcoffline.tune import LogCheck, check_log
 from mpcoffline.tune.covered import coverage, gain, readable
-from mpcoffline.tune.determined import _long
+from mpcoffline.tune.determined import in_words
 from mpcoffline.tune.experiment import experiments
 
 pytest.importorskip("polars")
@@ -101,12 +101,62 @@ def test_a_sound_log_is_worth_tuning_and_the_page_says_what_it_determines() -> N
     assert page.identification.noise.measurement[0] == pytest.approx(0.05, rel=0.3)
 
 
+def slow_room(seed: int, tau: float, n: int = 1_500) -> dict[str, np.ndarray]:
+    """A log of a room under feedback; its persons, who are counted, heat it through a lag of tau control intervals."""
+    rng, log = np.random.default_rng(seed), list[tuple[float, ...]]()
+    T, felt, persons, heat, step = 20.0, 0.0, 0.0, 0.5, 0.0
+    for k in range(n):
+        persons = float(rng.integers(0, 20)) if k % 25 == 0 else persons
+        step = 0.3 * rng.normal() if k % 10 == 0 else step
+        heat = float(np.clip(0.5 + 0.4 * (21.0 - T) + step, 0.0, 2.0))
+        log.append((60.0 * k, T + 0.01 * rng.normal(), heat, persons))
+        T += 0.05 * (18.0 - T) + 0.12 * heat + 0.02 * (felt if tau else persons) + 0.005 * rng.normal()
+        felt += (1.0 - np.exp(-1.0 / max(tau, 1e-3))) * (persons - felt)
+    return dict(zip(("time", "T", "heat", "persons"), np.array(log).T, strict=True))
+
+
+def room() -> Plant:
+    return Plant(
+        "room",
+        dt=60.0,
+        states=[State("T", "°C", 0, 60)],
+        inputs=[Input("heat", "kW", 0, 2)],
+        signals=[Signal("persons", low=0, high=30), Signal("wanted", "°C", usual=21.0)],
+        parameters={"loss": 0.05, "kW": 0.1, "each": 0.02},
+        dynamics=lambda x, u, d, p: [x.T + p.loss * (18.0 - x.T) + p.kW * u.heat + p.each * d.persons],
+        cost=lambda x, u, d: (x.T - d.wanted) ** 2 + 0.1 * u.heat,
+        discrete=True,
+    )
+
+
+@pytest.mark.parametrize("tau", [0.0, 10.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_signal_that_acts_slowly_is_named_with_its_time_constant_and_what_it_hides(seed: int, tau: float) -> None:
+    plant = room()
+    log = slow_room(seed, tau)
+    page = check_log(plant, plant.read(log | {"wanted": np.full(len(log["time"]), 21.0)}))
+    said = [each.text for each in page.remarks if each.about == "lag"]
+    assert len(said) == (tau > 0.0)
+    for text in said:
+        assert text.startswith("persons acts slowly, as through a lag with a time constant of about ")
+        amount, unit = text.split("about ")[1].split()[:2]
+        assert unit == "minutes:"
+        assert 60.0 * float(amount) == pytest.approx(60.0 * tau, rel=0.3)
+        assert "outputs=" in text
+    (lag,) = page.lags or [None]
+    assert (lag is None) == (tau == 0.0)
+    if lag is not None:
+        each = plant.mpc().model.space.names.index("each")
+        assert lag.after[each] == pytest.approx(0.02, rel=0.1)
+        assert abs(lag.before[each] - 0.02) > 3.0 * abs(lag.after[each] - 0.02)
+
+
 @pytest.mark.parametrize(
     ("seconds", "words"),
     [(0.25, "0.25 s"), (113.0, "110 s"), (200.0, "3.3 minutes"), (7_200.0, "2 hours"), (259_200.0, "3 days")],
 )
 def test_times_have_as_many_digits_as_they_deserve(seconds: float, words: str) -> None:
-    assert _long(seconds) == words
+    assert in_words(seconds) == words
 
 
 def test_the_verdict_claims_no_more_than_is_known() -> None:

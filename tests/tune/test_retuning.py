@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from planted_logs import heater, short_episodes
 from typer.testing import CliRunner
 
-from mpcoffline import FileFormatError, MPCPolicy
+from mpcoffline import MPC, FileFormatError, Model, MPCPolicy, Parameter, TransitionTable
 from mpcoffline.cli import app
 from mpcoffline.datasets.logs.wanted import Wanted
 from mpcoffline.diagnostics import diagnose
-from mpcoffline.diagnostics.trial import TODAY, TRIED, stretched, widening
+from mpcoffline.diagnostics.trial import TODAY, TRIED, _others, stretched, widening
+from mpcoffline.mpc import Block, ParameterSpace
+from mpcoffline.mpc.component import Component
 from mpcoffline.tune import Calibration, Tuned, retune
 
 pytest.importorskip("polars")
@@ -153,3 +157,41 @@ def test_what_reads_logs_comes_from_a_file_without_code(tuned: Tuned) -> None:
     for broken in ({"previews": []}, {"dt": -1.0}, {"cost": {"inputs": [1], "output": 1, "instructions": []}}):
         with pytest.raises((FileFormatError, ValueError)):
             Wanted.from_json(data | broken)
+
+
+class TwoValleys(Component):
+    """A cost with two goals, one as good as the other."""
+
+    def __init__(self) -> None:
+        self.space = ParameterSpace([Block.free("depth", np.array(1.0), "cost")])
+
+    def expression(self, x: ca.SX, u: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        return p["depth"] * (x[0] ** 2 - 1.0) ** 2 + 0.1 * u[0] ** 2
+
+    def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        return p["depth"] * (x[0] ** 2 - 1.0) ** 2
+
+
+def test_a_controller_that_keeps_to_one_of_two_good_plans_is_no_other_one() -> None:
+    """Between two goals a plan from nowhere goes to the nearer one, that of a controller to where it went before."""
+    model = Model(
+        lambda x, u, p: x + p["gain"] * u, 1, 1, 1.0, {"gain": Parameter(0.2, low=0.1, high=1.0)}, discrete=True
+    )
+    mpc = MPC(model, TwoValleys(), TwoValleys(), 15, 1.0, [-1.0], [1.0])
+    policy, rng, rows = MPCPolicy(mpc), np.random.default_rng(0), []
+    for episode in range(4):
+        state, x = None, np.array([-0.2 if episode % 2 else 0.2])
+        for _ in range(40):
+            u, state = policy.predict(x, state)
+            after = 0.05 * rng.normal(size=1)  # as if something held it there
+            rows.append((x, u, after, episode))
+            x = after
+    x, u, after, ids = (np.array(part) for part in zip(*rows, strict=True))
+
+    def of(inputs: Any) -> TransitionTable:
+        return TransitionTable.from_arrays(x, inputs, np.zeros(160), after, np.zeros(160), ids)
+
+    cold = policy.solver.solve(x).u0
+    assert np.mean(np.abs(cold - u) > 0.5) > 0.3
+    assert _others(mpc, of(u)) < 0.05
+    assert _others(mpc, of(0.5 * np.abs(rng.normal(size=u.shape)))) > 0.8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +55,16 @@ def test_the_folder_is_complete_and_says_what_it_holds(once: Tuned) -> None:
     assert text.startswith("Verdict: recommend\n")
     assert text.endswith(f"mpcoffline retune {once.folder} trial.csv")
     assert (once.folder / "controller" / "mpc_controller.c").is_file()
+
+
+def test_the_commands_that_a_result_ends_with_are_taken_as_they_are(once: Tuned, tmp_path: Path) -> None:
+    """What ``serve`` is told to do has a plant at its other end: here one that does not answer."""
+    (line,) = (each for each in once.next_steps if "mpcoffline serve" in each)
+    _, *words = shlex.split(line)
+    words = ["127.0.0.1:9" if word == "HOST:PORT" else word for word in words]
+    words[words.index("trial.csv")] = str(tmp_path / "trial.csv")
+    done = CliRunner().invoke(app, [*words, "--periods", "2", "--period", "0.01"])
+    assert done.exit_code == 0, done.output
 
 
 def test_the_same_call_finds_its_result_and_the_same_run_gives_it_again(

@@ -31,6 +31,10 @@ _OVER_ONE = 2.05  # times the usual time between rows, over one that is missing
 _CLIPPED = 0.01  # of an input's range, by which it may lie beyond its bounds
 _ROUNDED = 1e-3  # of a signal's range
 _MOST_BEYOND = 0.2  # share of rows
+_TOO_FAST = (
+    "All rows lie within {span:.3g} s, less than one control interval of the plant, {dt:g} s: is time in another unit,"
+    " or was a simulation run faster than its own time? A loop with a VirtualClock writes the plant's. "
+)
 _UNIT = "Is it in the unit of the plant file? units={...} says what the log's numbers are in."
 
 
@@ -228,6 +232,8 @@ def _sampled(name: str, rows: Rows, wanted: Wanted, max_gap: float, report: LogR
     index = np.flatnonzero(kept)
     if not len(index):
         hint = f"What was left out: {report}" if report.left_out else ""
+        if np.ptp(t) < dt:
+            hint = _TOO_FAST.format(span=np.ptp(t), dt=dt) + hint
         expected = f"two instants {dt:g} s apart of which everything is known"
         raise InvalidDataError(name, expected=expected, actual=f"none in {report.rows} rows", hint=hint)
     starts = np.ones(len(index), dtype=bool)

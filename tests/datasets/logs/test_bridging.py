@@ -87,3 +87,10 @@ def test_all_missing_columns_are_named_at_once(tmp_path: Path) -> None:
     file.write_text(text(simulated(), header="time,level_1,h2 [cm],pump,set_point"))
     with pytest.raises(InvalidDataError, match="column of 'h1'"):
         two_tanks().read(file)
+
+
+def test_a_log_that_was_written_faster_than_its_plant_is_says_so() -> None:
+    """A simulated loop by the computer's clock: hundreds of rows within one control interval."""
+    rng = np.random.default_rng(0)
+    with pytest.raises(InvalidDataError, match=r"All rows lie within 0\.998 s, less than one control .* VirtualClock"):
+        read(0.002 * np.arange(500), rng.normal(size=500), rng.choice([-1.0, 1.0], 500), [])
