@@ -129,6 +129,12 @@ def room() -> Plant:
     )
 
 
+def test_a_column_that_is_not_the_inputs_is_named_and_no_lag_of_it() -> None:
+    problems, advice = found_in(CASES["a column that was not applied"])
+    assert is_named(CASES["a column that was not applied"], problems, advice)
+    assert not any("acts slowly" in text for text in advice)
+
+
 @pytest.mark.parametrize("tau", [0.0, 10.0])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_signal_that_acts_slowly_is_named_with_its_time_constant_and_what_it_hides(seed: int, tau: float) -> None:
