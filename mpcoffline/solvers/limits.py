@@ -107,7 +107,7 @@ def changes(mpc: MPC, h: ca.SX, symbols: tuple[ca.SX, ca.SX, ca.SX]) -> list[tup
         symbols: x, u and theta.
     """
     nx, nu = mpc.nx, mpc.nu
-    if not mpc.layout.has_previous or min(mpc.layout.carried) < 1:
+    if min(mpc.layout.carried) < 1:
         return [None] * h.numel()
     z = ca.vertcat(*symbols)
     jacobian = ca.jacobian(h, z)

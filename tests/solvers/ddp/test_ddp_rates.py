@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mpcoffline import MPC, Constraint, Model, MPCPolicy, QuadraticCost, StateBounds
 from mpcoffline.solvers import DDPSolver, IpoptSolver, softened
+from mpcoffline.solvers.limits import limits_of
 
 Array = NDArray[np.float64]
 N, DISCOUNT = 20, 0.97
@@ -69,6 +70,24 @@ def test_one_side_alone() -> None:
     assert ours.success.all()
     np.testing.assert_allclose(ours.value, theirs.value, rtol=1e-6)
     assert changes(x, ours.u)[:, :, 0].min() == pytest.approx(-0.05)
+
+
+def test_beside_dead_time() -> None:
+    """Of what is asked for, not of what acts: the input before is the newest of those that are remembered."""
+    model = Model(lambda x, u, p: ca.DM(A) @ x + ca.DM(B) @ u, 2, 2, 1.0, discrete=True, delay=[2, 0])
+    mpc = problem(rates([0.2, 0.1], [0.05, 0.3])).replace(model=model)
+    rng = np.random.default_rng(0)
+    x = np.hstack([rng.uniform(-2.0, 2.0, (6, 2)), rng.uniform(0.1, 0.9, (6, mpc.nx - 2))])
+    found = limits_of(mpc, *(ca.SX.sym(name, n) for name, n in (("x", mpc.nx), ("u", 2), ("theta", mpc.space.size))))
+    assert found is not None
+    assert found.rates.elements.all()
+    ours, theirs = DDPSolver(mpc).solve(x), IpoptSolver(mpc).solve(x)
+    assert ours.success.all()
+    np.testing.assert_allclose(ours.value, theirs.value, rtol=1e-6)
+    first = ours.u[:, 0] - x[:, mpc.layout.previous]
+    moved = np.concatenate([first[:, None], np.diff(ours.u, axis=1)], axis=1)
+    assert (moved <= np.array([0.2, 0.1]) + 1e-12).all()
+    assert (moved >= -np.array([0.05, 0.3]) - 1e-12).all()
 
 
 def by_linear_programming(x: Array, of_state: Array, of_input: Array, up: Array, down: Array) -> float:
