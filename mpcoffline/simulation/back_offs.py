@@ -89,7 +89,7 @@ def backed_off(
 
     Args:
         mpc: The MPC.
-        around: Where it acts; from its usual starts.
+        around: Where it acts; from its usual starts, or half of them where that is enough to tell what pays.
         share: In which the limits are to be kept, e.g. 0.95; None for as far as that pays: limits without a price stay.
         tell: Is told which round it is.
 
@@ -101,13 +101,13 @@ def backed_off(
     if not limits or not around.models.votes.any():
         return BackOffs(mpc, {}, {}, {})
     pays, share = share is None, _SELDOM if share is None else share
-    cost: Array = np.zeros((1, 1))
+    cost, n_starts = np.zeros((1, 1)), -(-around.usual // 2) if pays else around.usual
     none = {limit.name: np.zeros(limit.function.size1_out(0)) for limit in limits}
     amounts, best, kept, before = none, (mpc, none), dict[str, float](), dict[str, float]()
     for k in range(_ROUNDS):
         tell(k, _ROUNDS, "limits made tighter")
         tried = _tightened(mpc, amounts)
-        episodes = _acting(tried, around)
+        (episodes,) = around.act([around.seeing(quick_policy(tried))], slice(0, n_starts), n_starts)
         found = {limit.name: _values(limit, mpc, episodes, around) for limit in limits}
         now = {name: _share(h) for name, h in found.items()}
         before, own = before or now, episodes.cost[around.models.votes]
@@ -126,11 +126,6 @@ def backed_off(
 def _missing(kept: Mapping[str, float], share: float) -> float:
     """In which share of the steps too many are violated, of all limits together."""
     return float(sum(max(share - each, 0.0) for each in kept.values()))
-
-
-def _acting(tried: MPC, around: Surroundings) -> Episodes:
-    (episodes,) = around.act([around.seeing(quick_policy(tried))], slice(0, around.usual), around.usual)
-    return episodes
 
 
 def _is_cheaper(cost: Array, before: Array) -> bool:
