@@ -286,16 +286,14 @@ def tried(
         seconds["polishing"] = core_seconds() - begun
         steps.append(chosen)
     effort = Effort.of(trials, seconds, steps)
-    tighter: BackOffs | None = backed_off(mpcs[chosen], around, keep_limits, tell)
-    if tighter is not None and tighter.mpc is not mpcs[chosen]:
+    tighter, taken = backed_off(mpcs[chosen], around, keep_limits, tell), keep_limits is not None
+    if tighter.mpc is not mpcs[chosen]:
         name = chosen + TIGHTER
         mpcs, trials = {**mpcs, name: tighter.mpc}, trials.with_names([name])
         trials.fill({name: around.seeing(quick_policy(tighter.mpc))}, around, slice(0, len(trials.rows)))
-        taken = keep_limits is not None or (trials.improves(name) and trials.improves(name, chosen))
-        chosen, tighter = (name, tighter) if taken else (chosen, None)
-    elif keep_limits is None:
-        tighter = None
-    found = Candidates(mpcs, chosen, trials, tighter, effort)
+        taken = taken or (trials.improves(name) and trials.improves(name, chosen))
+        chosen = name if taken else chosen
+    found = Candidates(mpcs, chosen, trials, tighter if taken else None, effort)
     if polish:
         logger.info("%s", effort)
     outcome.log(logging.WARNING if chosen == FIRST else logging.INFO, "%s\n%s", found.finding, found)

@@ -130,8 +130,9 @@ def _missing(kept: Mapping[str, float], share: float) -> float:
 
 def _is_cheaper(cost: Array, before: Array) -> bool:
     """Whether episodes ``(models, starts)`` cost less than before, beyond chance, on half of the models."""
-    gain = before - cost
-    error = gain.std(axis=1) / np.sqrt(gain.shape[1])
+    with np.errstate(invalid="ignore"):  # of loops that run away
+        gain = before - cost
+        error = gain.std(axis=1) / np.sqrt(gain.shape[1])
     return bool(np.mean(gain.mean(axis=1) > _SURE * error) >= 0.5)
 
 

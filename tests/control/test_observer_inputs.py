@@ -109,10 +109,11 @@ def test_a_batch_is_its_loops_and_each_begins_without_inputs(tmp_path: Path) -> 
     mpc, rng = mpc_of([1, 0]), np.random.default_rng(3)
     policy = OutputFeedbackPolicy(MPCPolicy(mpc), observer_of(mpc))
     policy.save(tmp_path / "policy.zip")
-    ys, states = rng.normal(0.2, 0.3, (6, 2, 2)), [None, None]
+    ys = rng.normal(0.2, 0.3, (6, 2, 2))
     ys[3, 1] = np.nan
     policies = [policy, OutputFeedbackPolicy.load(tmp_path / "policy.zip"), pickle.loads(pickle.dumps(policy))]
     carried: list[Any] = [None] * 3
+    states: list[Any] = [None] * 2
     for k, y in enumerate(ys):
         begun = np.array([k == 4, False])
         together = []
@@ -122,7 +123,7 @@ def test_a_batch_is_its_loops_and_each_begins_without_inputs(tmp_path: Path) -> 
         np.testing.assert_array_equal(together[0], together[1])
         np.testing.assert_array_equal(together[0], together[2])
         for i in range(2):
-            action, states[i] = policy.predict(y[i], states[i], begun[i : i + 1])  # type: ignore[call-overload]
+            action, states[i] = policy.predict(y[i], states[i], begun[i : i + 1])
             np.testing.assert_allclose(together[0][i], action, atol=1e-6)
     cold = policy.predict([9.0, ys[4, 0, 1]])[1]
     lost = policy.predict([np.nan, ys[4, 0, 1]])[1]
