@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
@@ -22,6 +23,7 @@ from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy, 
 from mpcoffline.simulation.polishing import Kept, polished
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
+from mpcoffline.solvers.ddp import Ahead
 
 from .effort import Effort, core_seconds
 
@@ -269,11 +271,19 @@ def tried(
     mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
-    asked: dict[str, Any] = {"slow": slow, "choosing": True, "seed": known.seed, "sensors": sensors}
-    around = surroundings_of(known.mpc, nominal, table, known.found, **asked)
-    around = various_first(around, mpcs[FIRST])
-    trials, chosen = choose(mpcs, around, variants, tell, FULL)
+    with Ahead(torch.get_num_threads() - 1) as ahead:
+        ahead.start(mpcs.values())
+
+        def variants_ahead(good: Mapping[str, MPC], turn: int) -> Mapping[str, MPC]:
+            found = variants(good, turn)
+            ahead.start(found.values())
+            return found
+
+        slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
+        asked: dict[str, Any] = {"slow": slow, "choosing": True, "seed": known.seed, "sensors": sensors}
+        around = surroundings_of(known.mpc, nominal, table, known.found, **asked)
+        around = various_first(around, mpcs[FIRST])
+        trials, chosen = choose(mpcs, around, variants_ahead, tell, FULL)
     seconds, steps = {"the regressions": learned_in, "the choice": core_seconds() - begun}, [FIRST, FULL, chosen]
     if polish:
         begun = core_seconds()

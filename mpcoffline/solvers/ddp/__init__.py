@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
+from .ahead import Ahead
 from .build import CompilerError
 from .solver import DDPSolver
 
-__all__ = ["CompilerError", "DDPSolver"]
+__all__ = ["Ahead", "CompilerError", "DDPSolver"]

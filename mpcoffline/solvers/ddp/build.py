@@ -13,6 +13,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from concurrent.futures import Future
 from pathlib import Path
 
 from mpcoffline.core.caches import mark_used, trim
@@ -60,7 +61,22 @@ class CompilerError(MPCOfflineError, RuntimeError):
     """There is no working C compiler."""
 
 
+#: Sources that are compiled in the background; see :mod:`.ahead`.
+underway: dict[str, Future[ctypes.CDLL]] = {}
+
+
 def compiled(source: str) -> ctypes.CDLL:
+    """The shared library of a C source, compiled unless the cache has it, or it is being compiled.
+
+    Raises:
+        CompilerError: If there is no compiler, or none that works, or a working one fails.
+    """
+    begun = underway.get(source)
+    # One that waits for its turn is not waited for.
+    return compiled_here(source) if begun is None or begun.cancel() else begun.result()
+
+
+def compiled_here(source: str) -> ctypes.CDLL:
     """The shared library of a C source, compiled unless the cache has it.
 
     The key holds the source, the flags, and the compiler with the processor features that it targets. A library is
