@@ -24,6 +24,7 @@ class Target(StrEnum):
     c = "c"
     do_mpc = "do-mpc"
     casadi = "casadi"
+    fmi = "fmi"
     onnx = "onnx"
 
 
@@ -32,6 +33,7 @@ class Target(StrEnum):
         "mpcoffline export learner_policy.zip --out controller/",
         "mpcoffline export learner_policy.zip --to do-mpc --out controller/",
         "mpcoffline export learner_policy.zip --to casadi --out controller/",
+        "mpcoffline export learner_policy.zip --to fmi --out controller/",
         "mpcoffline export distilled.zip --to c --out controller/",
         "mpcoffline export learner.zip --to onnx --out controller/",
     )
@@ -39,7 +41,7 @@ class Target(StrEnum):
 def export(
     policy: Controller,
     to: Annotated[
-        Target, typer.Option(help="C99, a script for do-mpc, CasADi's files of the problem, or ONNX.")
+        Target, typer.Option(help="C99, a script for do-mpc, CasADi's files of the problem, an FMU, or ONNX.")
     ] = Target.c,
     out: Annotated[Path, typer.Option(help="Folder for the files.", file_okay=False)] = Path("controller"),
 ) -> None:
@@ -52,6 +54,8 @@ def export(
     With `--to do-mpc`: a script for do-mpc that makes the same controller, and its functions as CasADi's files.
 
     With `--to casadi`: model, costs and the whole nonlinear program as CasADi's files, and a script that solves it.
+
+    With `--to fmi`: its model, a differential equation, as an FMU of FMI 3.0 for model exchange.
 
     With `--to onnx`: an explicit policy, or of a learner its value function V.
     """
@@ -78,8 +82,10 @@ def _exported(policy: Path, to: Target, out: Path) -> list[Path]:
         return export_c(controller, out)
     from mpcoffline.control.export_casadi import export_casadi
     from mpcoffline.control.export_do_mpc import export_do_mpc
+    from mpcoffline.control.export_fmi import export_fmi
 
-    return (export_do_mpc if to is Target.do_mpc else export_casadi)(loaded_policy(policy), out)
+    written = {Target.do_mpc: export_do_mpc, Target.fmi: export_fmi, Target.casadi: export_casadi}
+    return written[to](loaded_policy(policy), out)
 
 
 class Waste(StrEnum):
