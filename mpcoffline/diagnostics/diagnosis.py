@@ -24,8 +24,9 @@ from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.behaviour import Agreement, Behaviour, agreement
 from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
+from mpcoffline.simulation.episodes import Controller, Episodes
 from mpcoffline.simulation.surroundings import surroundings_of
-from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Trials
+from mpcoffline.simulation.trials import Surroundings, Trials
 
 from .background import (
     Background,

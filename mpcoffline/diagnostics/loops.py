@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc.layout import Layout
-from mpcoffline.simulation.trials import Episodes, Surroundings, Trials
+from mpcoffline.simulation.episodes import Episodes
+from mpcoffline.simulation.trials import Surroundings, Trials
 
 SHOWN_OF = 64  # starts, the first ones, among which those that are shown are chosen
 
