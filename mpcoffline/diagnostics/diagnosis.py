@@ -147,7 +147,8 @@ def diagnose(
         trust = _trust(agreed, trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     plain, priced = (clean, clean) if cost.limits is None else (cost.limits.without(clean), cost.limits.whole(clean))
-    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
+    tried = {name: loops[name] for name in policies}
+    shown = chosen_loops(trials, chosen, tried, learned.layout, around, nominal)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(trials, chosen, failed=failed[1], choice=choice)
