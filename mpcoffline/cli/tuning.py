@@ -9,6 +9,7 @@ import typer
 from rich.text import Text
 
 from mpcoffline.core.errors import visible
+from mpcoffline.core.progress import Stages
 
 from .common import console, examples, message, print_json, say_prose, working
 from .options import Json, Preset, Seed, checked_share
@@ -85,21 +86,22 @@ def tune(
 
     Where the verdict is "keep MPC_1", policy.zip is MPC_1, the controller of the plant file as it is.
     """
-    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
-    _tell(f"Reading {', '.join(log.name for log in logs)}")
+    options, stages = read_options(column, unit, where, time, time_format, timezone, episode, max_gap), Stages(_tell)
+    stages(f"Reading {', '.join(log.name for log in logs)}")
     with working("Reading"):
         from mpcoffline.plants import load_description
         from mpcoffline.tune import tune as tuned
 
         plant = load_description(file)
         table = plant.read(logs, **options)
-    _tell(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
+    stages(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
     try:
         more: dict[str, Any] = {} if keep_limits is None else {"keep_limits": keep_limits}
-        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=_tell, **more)
+        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=stages, **more)
     except KeyboardInterrupt:
         _tell("What was finished is kept: the same command goes on from there.")
         raise
+    stages.end()
     _show(result, as_json)
 
 
@@ -125,16 +127,17 @@ def retune(
     options hold for it, too. Simulates the trial on the models of the log before it, and compares; then fits again with
     both logs. The folder is replaced as a whole; what it held is kept in a numbered one inside.
     """
-    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
-    _tell(f"Reading {', '.join(log.name for log in trial)}")
+    options, stages = read_options(column, unit, where, time, time_format, timezone, episode, max_gap), Stages(_tell)
+    stages(f"Reading {', '.join(log.name for log in trial)}")
     from mpcoffline.tune import retune as retuned
     from mpcoffline.tune.retuning import trial_lines
 
     try:
-        result = retuned(folder, trial, read=options, tell=_tell)
+        result = retuned(folder, trial, read=options, tell=stages)
     except KeyboardInterrupt:
         _tell("What was finished is kept: the same command goes on from there.")
         raise
+    stages.end()
     if not as_json:
         far = result.calibration is not None and result.calibration.far
         head, *rest = trial_lines(result.tuned.document)
