@@ -32,6 +32,17 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+Trial = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG",
+        help="Logs of the trial: CSV, Parquet or Arrow.",
+        exists=True,
+        dir_okay=False,
+        show_default=False,
+    ),
+]
+
 
 @app.command(
     epilog=examples(
@@ -69,9 +80,9 @@ def tune(
         float | None,
         typer.Option(
             metavar="SHARE",
-            help="Make limits tighter until simulated closed loops keep the given ones in this share of their steps, as"
-            " 0.95; a plan that keeps a limit to the digit is pushed over it by what nobody predicts.",
-            show_default="as they are",
+            help="Tighten the limits inside the controller until simulated closed loops keep the given ones in this"
+            " share of their steps, as 0.95: disturbances push a plan that just keeps a limit over it.",
+            show_default="as far as that pays",
             callback=checked_share,
         ),
     ] = None,
@@ -110,7 +121,7 @@ def retune(
     folder: Annotated[
         Path, typer.Argument(metavar="TUNED", help="The folder that tune made.", exists=True, file_okay=False)
     ],
-    trial: Logs,
+    trial: Trial,
     column: Columns = None,
     unit: Units = None,
     where: Where = None,
@@ -123,9 +134,10 @@ def retune(
 ) -> None:
     """Learn from a trial, too, and say whether it cost what was predicted.
 
-    Reads the log of a trial with the tuned controller: one of `mpcoffline serve`, or one like that given to tune, whose
-    options hold for it, too. Simulates the trial on the models of the log before it, and compares; then fits again with
-    both logs. The folder is replaced as a whole; what it held is kept in a numbered one inside.
+    Reads the log of a trial with the tuned controller: that of `mpcoffline serve`, or one with the header of the log
+    that tune was given, which is read with the same options unless others are given here. Simulates the trial on the
+    models of the log before it, and compares; then fits again with both logs. The folder is replaced as a whole; what
+    it held is kept in a numbered one inside.
     """
     options, stages = read_options(column, unit, where, time, time_format, timezone, episode, max_gap), Stages(_tell)
     stages(f"Reading {', '.join(log.name for log in trial)}")
