@@ -312,8 +312,9 @@ class Surroundings:
             reached[..., :n] += disturbances[:, None, :, k]
             reached[..., n:ny] = signals[:, k]
             steps = *flat, reached.reshape(flat[0].shape)
-            for costs, function in ((total, self.cost), (second, self.cost.second)):
-                now = np.where(over, 0.0, np.where(lost, self._dearest, function(*steps).reshape(shape)))
+            priced = self.cost(*steps)
+            for costs, each in ((total, priced), (second, priced if self.cost.alike else self.cost.second(*steps))):
+                now = np.where(over, 0.0, np.where(lost, self._dearest, each.reshape(shape)))
                 costs += now
                 np.minimum(least, now.min(axis=2), out=least)
             ended = self.cost.ended(*steps).reshape(shape) & ~lost & ~over
