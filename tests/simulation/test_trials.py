@@ -78,7 +78,8 @@ def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller
     controller = around.seeing(MPCPolicy(TRUE_MPC))
     assert isinstance(controller, OutputFeedbackPolicy)
     behind, seeing = around.act([controller, MPCPolicy(TRUE_MPC)], kept=3)
-    np.testing.assert_array_equal(seeing.cost, plain.act([MPCPolicy(TRUE_MPC)])[0].cost)
+    # The same but for rounding: costs of a batch of another size are summed in another order.
+    np.testing.assert_allclose(seeing.cost, plain.act([MPCPolicy(TRUE_MPC)])[0].cost, rtol=1e-13)
     for m in range(len(models)):
         x, state, expected = LOG.observations[rows].astype(np.float64), None, np.zeros(3)
         policy = OutputFeedbackPolicy(MPCPolicy(TRUE_MPC), sensors.observer(TRUE_MPC))
