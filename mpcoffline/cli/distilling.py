@@ -43,13 +43,13 @@ def distill(
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="File for the explicit policy.", dir_okay=False)] = Path("distilled.zip"),
-    multiply_adds: Annotated[int, typer.Option(help="The most that an action may take.", min=1)] = 2000,
-    labels: Annotated[int, typer.Option(help="MPCs that are solved as examples, about.", min=1)] = 40_000,
+    multiply_adds: Annotated[int, typer.Option(help="The most multiply-adds that one action may take.", min=1)] = 2000,
+    labels: Annotated[int, typer.Option(help="About how many MPCs are solved as examples.", min=1)] = 40_000,
     seed: Seed = 0,
     alpha: PlantAlpha = None,
     as_json: Json = False,
 ) -> None:
-    """Make a small network of an MPC that acts as it does: for where nothing can be solved.
+    """Make a small network that acts as an MPC does, for devices that cannot solve one.
 
     The examples come from closed loops on the MPC's own model, those of the network among them. What the network costs
     more than the MPC is measured there, from other starts, and in the environment, if one is given.

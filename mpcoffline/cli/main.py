@@ -26,7 +26,8 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Start with:\n\nmpcoffline run pendulum\n\nWith a plant of your own:\n\nmpcoffline new plant.py\n\n"
+    epilog="Start with:\n\nmpcoffline run pendulum\n\nWith a plant of your own, and a log of it:\n\n"
+    "mpcoffline new plant.py\n\nmpcoffline check plant.py log.csv\n\nmpcoffline tune plant.py log.csv\n\n"
     "Something wrong? Run:\n\nmpcoffline doctor",
 )
 

@@ -48,14 +48,16 @@ Columns = Annotated[
     typer.Option(
         "--column",
         metavar="NAME=HEADER",
-        help="The header of a column that is not called by the plant's name, or its first words; repeatable. In a plant"
-        " file: columns={...}.",
+        help="Which column a quantity of the plant is, where the header is not its name: h1=LI-101, the header or its"
+        " first words; repeatable. In a plant file: columns={...}.",
     ),
 ]
 Units = Annotated[
     list[str] | None,
     typer.Option(
-        "--unit", metavar="NAME=UNIT", help="The log's unit, where its header says none or another; repeatable."
+        "--unit",
+        metavar="NAME=UNIT",
+        help="The log's unit of a quantity, where its header says none or a wrong one; repeatable.",
     ),
 ]
 Where = Annotated[
@@ -63,7 +65,8 @@ Where = Annotated[
     typer.Option(
         "--where",
         metavar="HEADER=VALUE",
-        help="Read rows with this value alone, as mode=AUTO; the same header again: or with that one.",
+        help="Read only rows that have this value, as mode=AUTO; given again for the same header, rows with any of its"
+        " values.",
     ),
 ]
 Time = Annotated[
@@ -71,7 +74,7 @@ Time = Annotated[
     typer.Option(
         "--time",
         metavar="HEADER",
-        help="Header of the time; of date and time, if given twice.",
+        help="Header of the time column; twice, where date and time have a column each.",
         show_default="looked for",
     ),
 ]
@@ -80,16 +83,24 @@ TimeFormat = Annotated[
     typer.Option(metavar="FORM", help="How time stamps are written, as '%d.%m.%Y %H:%M'.", show_default="found out"),
 ]
 Timezone = Annotated[
-    str | None, typer.Option(metavar="ZONE", help="Of stamps without offset, as Europe/Berlin.", show_default="none")
+    str | None,
+    typer.Option(
+        metavar="ZONE", help="Time zone of stamps that do not say theirs, as Europe/Berlin.", show_default="none"
+    ),
 ]
 Episode = Annotated[
-    str | None, typer.Option(metavar="HEADER", help="Header of what tells episodes apart.", show_default="gaps alone")
+    str | None,
+    typer.Option(
+        metavar="HEADER",
+        help="Header of a column whose changes begin new episodes, as a batch number.",
+        show_default="gaps alone",
+    ),
 ]
 MaxGap = Annotated[
     float | None,
     typer.Option(
         metavar="SECONDS",
-        help="Seconds between rows that begin a new episode.",
+        help="A longer pause between two rows begins a new episode.",
         min=0.0,
         show_default="1.5 control intervals",
     ),
@@ -144,8 +155,9 @@ def check(
     """Say what a log and a plant file say of each other, before anything is fitted.
 
     Reads the log (units, time stamps, gaps, broken sensors), then compares: units, signs, exchanged columns, dead time,
-    noise, sampling, which parameters the log determines and which experiment would determine the others, how far
-    predictions are, whether the goal was ever visited. The first line says whether tuning is worth it.
+    inputs that act or move slowly, noise, sampling, which parameters the log determines and which experiment would
+    determine the others, how far off predictions are, whether the goal was ever visited. The first line says whether
+    tuning is worth it. Nothing is written.
 
     Exits with 1 where something is to be mended first.
     """

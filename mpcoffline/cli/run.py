@@ -105,12 +105,14 @@ def reproduce(
 def collect(
     task: TaskArgument,
     alpha: PlantAlpha = None,
-    steps: Annotated[int | None, typer.Option(help="Transitions.", show_default="the task's, 50000", min=1)] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Transitions to record.", show_default="the task's, 50000", min=1)
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(help="Seed of agent and environment.", show_default="the task's, 0", min=0)
     ] = None,
     dataset_id: Annotated[
-        str | None, typer.Option(help="Minari id of the new data set.", show_default="says what differs")
+        str | None, typer.Option(help="Minari id of the new data set.", show_default="the task's, and what differs")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a data set of that id.")] = False,
 ) -> None:

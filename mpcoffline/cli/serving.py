@@ -30,7 +30,11 @@ def serve(
     policy: Controller,
     device: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help="The plant, one JSON object a line over TCP.", show_default=False),
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Address of the plant, which answers one JSON object a line over TCP.",
+            show_default=False,
+        ),
     ] = None,
     simulate: Annotated[
         Path | None,
@@ -44,7 +48,7 @@ def serve(
     ] = None,
     log: Annotated[
         Path | None,
-        typer.Option(help="CSV of every decision; an existing one goes on.", dir_okay=False, show_default="none"),
+        typer.Option(help="CSV of every decision; an existing one is continued.", dir_okay=False, show_default="none"),
     ] = None,
     periods: Annotated[
         int | None,
@@ -59,7 +63,10 @@ def serve(
         typer.Option(metavar="INPUT=VALUE", help="The safe input; repeatable. Others are held.", show_default=False),
     ] = None,
     hold: Annotated[
-        int, typer.Option(help="Periods without a decision that are bridged by the input before.", min=0)
+        int,
+        typer.Option(
+            help="How many periods without a decision the input before is held, until the fall-back comes in.", min=0
+        ),
     ] = 5,
     transfer: Annotated[int, typer.Option(help="Decisions over which the policy takes over.", min=1)] = 10,
     seed: Seed = 0,

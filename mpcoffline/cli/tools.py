@@ -105,7 +105,7 @@ def clean(
     yes: Annotated[bool, typer.Option("--yes", help="Remove it.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Say what can go and how much room it takes; with `--yes` remove it.
+    """Say what piled up on this machine can go, and how much room it takes; with `--yes` remove it.
 
     **leftovers**: what killed processes had half built. **caches**: compiled solvers and tables, which are made again
     when needed. **downloads** that broke off, and **backups** of repaired data sets, only if named. Data sets, and
@@ -124,7 +124,7 @@ def clean(
 
 @app.command(epilog=examples("mpcoffline doctor", "mpcoffline doctor --json > doctor.json"))
 def doctor(as_json: Json = False) -> None:
-    """Check this installation: versions, C compiler, cache, solvers, data sets, GPU, threads. Put it into bug reports.
+    """Check this installation: versions, C compiler, cache, solvers, data sets, GPU, threads; what bug reports need.
 
     Exit code 1 if something that is needed is broken.
     """

@@ -9,6 +9,7 @@ import typer
 from rich.text import Text
 
 from mpcoffline.core.errors import visible
+from mpcoffline.core.progress import Stages
 
 from .common import console, examples, message, print_json, say_prose, working
 from .options import Json, Preset, Seed, checked_share
@@ -30,6 +31,17 @@ if TYPE_CHECKING:
     from mpcoffline.tune import Tuned
 
 app = typer.Typer()
+
+Trial = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG",
+        help="Logs of the trial: CSV, Parquet or Arrow.",
+        exists=True,
+        dir_okay=False,
+        show_default=False,
+    ),
+]
 
 
 @app.command(
@@ -68,9 +80,9 @@ def tune(
         float | None,
         typer.Option(
             metavar="SHARE",
-            help="Make limits tighter until simulated closed loops keep the given ones in this share of their steps, as"
-            " 0.95; a plan that keeps a limit to the digit is pushed over it by what nobody predicts.",
-            show_default="as they are",
+            help="Tighten the limits inside the controller until simulated closed loops keep the given ones in this"
+            " share of their steps, as 0.95: disturbances push a plan that just keeps a limit over it.",
+            show_default="as far as that pays",
             callback=checked_share,
         ),
     ] = None,
@@ -85,21 +97,22 @@ def tune(
 
     Where the verdict is "keep MPC_1", policy.zip is MPC_1, the controller of the plant file as it is.
     """
-    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
-    _tell(f"Reading {', '.join(log.name for log in logs)}")
+    options, stages = read_options(column, unit, where, time, time_format, timezone, episode, max_gap), Stages(_tell)
+    stages(f"Reading {', '.join(log.name for log in logs)}")
     with working("Reading"):
         from mpcoffline.plants import load_description
         from mpcoffline.tune import tune as tuned
 
         plant = load_description(file)
         table = plant.read(logs, **options)
-    _tell(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
+    stages(f"{len(table):,} control intervals of {plant.dt:g} s, {table.n_episodes} without a gap")
     try:
         more: dict[str, Any] = {} if keep_limits is None else {"keep_limits": keep_limits}
-        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=_tell, **more)
+        result = tuned(plant, table, out, preset=preset.value, polish=polish, seed=seed, tell=stages, **more)
     except KeyboardInterrupt:
         _tell("What was finished is kept: the same command goes on from there.")
         raise
+    stages.end()
     _show(result, as_json)
 
 
@@ -108,7 +121,7 @@ def retune(
     folder: Annotated[
         Path, typer.Argument(metavar="TUNED", help="The folder that tune made.", exists=True, file_okay=False)
     ],
-    trial: Logs,
+    trial: Trial,
     column: Columns = None,
     unit: Units = None,
     where: Where = None,
@@ -121,20 +134,22 @@ def retune(
 ) -> None:
     """Learn from a trial, too, and say whether it cost what was predicted.
 
-    Reads the log of a trial with the tuned controller: one of `mpcoffline serve`, or one like that given to tune, whose
-    options hold for it, too. Simulates the trial on the models of the log before it, and compares; then fits again with
-    both logs. The folder is replaced as a whole; what it held is kept in a numbered one inside.
+    Reads the log of a trial with the tuned controller: that of `mpcoffline serve`, or one with the header of the log
+    that tune was given, which is read with the same options unless others are given here. Simulates the trial on the
+    models of the log before it, and compares; then fits again with both logs. The folder is replaced as a whole; what
+    it held is kept in a numbered one inside.
     """
-    options = read_options(column, unit, where, time, time_format, timezone, episode, max_gap)
-    _tell(f"Reading {', '.join(log.name for log in trial)}")
+    options, stages = read_options(column, unit, where, time, time_format, timezone, episode, max_gap), Stages(_tell)
+    stages(f"Reading {', '.join(log.name for log in trial)}")
     from mpcoffline.tune import retune as retuned
     from mpcoffline.tune.retuning import trial_lines
 
     try:
-        result = retuned(folder, trial, read=options, tell=_tell)
+        result = retuned(folder, trial, read=options, tell=stages)
     except KeyboardInterrupt:
         _tell("What was finished is kept: the same command goes on from there.")
         raise
+    stages.end()
     if not as_json:
         far = result.calibration is not None and result.calibration.far
         head, *rest = trial_lines(result.tuned.document)

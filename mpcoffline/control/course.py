@@ -66,13 +66,13 @@ def course_from(
         InvalidArgumentError: For a state of another MPC or batch size, or starts of another shape.
     """
     layout = mpc.layout
-    usual = np.tile(layout.filled(mpc.usual_input), (n_problems, 1)) if layout.n_memory else None
+    remembers = layout.n_memory > 0
     if state is None:
-        return Plan.none(n_problems, mpc), usual
-    least = 2 if usual is None else 3
+        return Plan.none(n_problems, mpc), _usual(mpc, n_problems) if remembers else None
+    least = 3 if remembers else 2
     most = least + (mpc.constraints is not None)  # the multipliers of its limits, if the solver knows them
     if not least <= len(state) <= most:
-        what = "states and inputs" if usual is None else "states, inputs and past inputs"
+        what = "states, inputs and past inputs" if remembers else "states and inputs"
         raise InvalidArgumentError("state", expected=f"what predict returned: {what}", actual=f"{len(state)} arrays")
     plan = Plan(*state[:2], *state[least:])
     if len(plan.u) != n_problems:
@@ -89,11 +89,16 @@ def course_from(
         started = np.broadcast_to(started, (n_problems,))
     if started.any():  # hardly ever
         plan = plan.select(~started)
-    if usual is None:
+    if not remembers:
         return plan, None
-    memory = np.asarray(state[2], dtype=np.float64)
-    if memory.shape != usual.shape:
-        raise InvalidArgumentError(
-            "state", expected=f"past inputs of shape {usual.shape}", actual=f"shape {memory.shape}"
-        )
-    return plan, np.where(started[:, None] | ~np.isfinite(memory), usual, memory)
+    memory, shape = np.asarray(state[2], dtype=np.float64), (n_problems, layout.n_memory)
+    if memory.shape != shape:
+        raise InvalidArgumentError("state", expected=f"past inputs of shape {shape}", actual=f"shape {memory.shape}")
+    unknown = started[:, None] | ~np.isfinite(memory)
+    # What is usual takes as long to find as many a solve, and is hardly ever asked.
+    return plan, np.where(unknown, _usual(mpc, n_problems), memory) if unknown.any() else memory
+
+
+def _usual(mpc: MPC, n_problems: int) -> Array:
+    """Past inputs of which nothing is known, ``(B, n_memory)``."""
+    return np.tile(mpc.layout.filled(mpc.usual_input), (n_problems, 1))

@@ -24,8 +24,9 @@ from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.behaviour import Agreement, Behaviour, agreement
 from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
+from mpcoffline.simulation.episodes import Controller, Episodes
 from mpcoffline.simulation.surroundings import surroundings_of
-from mpcoffline.simulation.trials import Controller, Episodes, Surroundings, Trials
+from mpcoffline.simulation.trials import Surroundings, Trials
 
 from .background import (
     Background,
@@ -146,7 +147,8 @@ def diagnose(
         trust = _trust(agreed, trials.votes)
     lag, cost = lag_check(identified, clean), around.cost
     plain, priced = (clean, clean) if cost.limits is None else (cost.limits.without(clean), cost.limits.whole(clean))
-    shown = chosen_loops(trials, chosen, {name: loops[name] for name in policies}, learned.layout, around)
+    tried = {name: loops[name] for name in policies}
+    shown = chosen_loops(trials, chosen, tried, learned.layout, around, nominal)
     failed = policies[FIRST].solver_stats.failed_share, policies[chosen].solver_stats.failed_share
     choice = None if learner.candidates is None else learner.candidates.trials
     judgement = decide(trials, chosen, failed=failed[1], choice=choice)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC, Penalty
-from mpcoffline.simulation.trials import Episodes
+from mpcoffline.simulation.episodes import Episodes
 from mpcoffline.simulation.violations import TRIFLE, limit_functions, moved
 
 from .verdict import Judgement

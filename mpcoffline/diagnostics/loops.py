@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc import MPC
 from mpcoffline.mpc.layout import Layout
-from mpcoffline.simulation.trials import Episodes, Surroundings, Trials
+from mpcoffline.simulation.episodes import Episodes
+from mpcoffline.simulation.trials import Surroundings, Trials
+
+from .marks import Marks, marks_of
 
 SHOWN_OF = 64  # starts, the first ones, among which those that are shown are chosen
 
@@ -27,6 +31,7 @@ class Loop:
         actions: Likewise, ``(T, nu)``.
         states_on: Of each controller, ``(models, T + 1, n)``.
         actions_on: Likewise, ``(models, T, nu)``.
+        marks: Set-points, limits, and what came from outside: the same for all.
     """
 
     row: int
@@ -35,6 +40,7 @@ class Loop:
     actions: Array = field(repr=False)
     states_on: Mapping[str, Array] = field(repr=False)
     actions_on: Mapping[str, Array] = field(repr=False)
+    marks: Marks = field(default_factory=Marks, repr=False)
 
 
 def chosen_loops(
@@ -43,6 +49,7 @@ def chosen_loops(
     episodes: Mapping[str, Episodes],
     layout: Layout,
     around: Surroundings,
+    given: MPC,
 ) -> tuple[Loop, ...]:
     """The start with the median gain, and those where the proposal gains most and least.
 
@@ -52,6 +59,7 @@ def chosen_loops(
         episodes: What each controller does from the first starts.
         layout: Of the states.
         around: The starts, and the transitions of which they are rows.
+        given: MPC_1, which says what is to be followed and kept.
 
     Returns:
         Up to three loops; none where no model has a vote.
@@ -65,8 +73,16 @@ def chosen_loops(
         states, actions = _logged(around.logged, int(around.rows[k]), around.n_steps)
         on = {name: each.states_kept[trials.votes, k, :, :n] for name, each in episodes.items()}
         inputs = {name: each.actions_kept[trials.votes, k] for name, each in episodes.items()}
-        found.append(Loop(int(around.rows[k]), why, states[:, :n], actions, on, inputs))
+        marks = marks_of(given, _outside(around, k, layout))
+        found.append(Loop(int(around.rows[k]), why, states[:, :n], actions, on, inputs, marks))
     return tuple(found)
+
+
+def _outside(around: Surroundings, k: int, layout: Layout) -> Array:
+    """Observations along a start of which the signals are those of the simulations, ``(T + 1, ny)``."""
+    begun, signals = np.asarray(around.starts[k])[: layout.ny], around.signals[k]
+    held = np.broadcast_to(begun[: layout.n_states], (len(signals), layout.n_states))
+    return np.vstack([begun, np.hstack([held, signals])])
 
 
 def _chosen(trials: Trials, proposal: str, kept: int) -> dict[int, str]:

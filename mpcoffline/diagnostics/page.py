@@ -15,7 +15,7 @@ from markupsafe import Markup
 from mpcoffline.core.tables import Table
 from mpcoffline.core.text import figure, listed, visible
 
-from .background import Names, ParameterLine
+from .background import Background, Names, ParameterLine
 from .differences import SURE, TODAY, Difference, candidates
 from .page_figures import loop_panels, panels
 from .verdict import costs_of
@@ -95,6 +95,7 @@ def page_of(report: Report, *, title: str = "", names: Names | None = None, sect
         proposal=report.judgement.proposal,
         pictures={name: (Markup(each.svg), each.caption) for name, each in pictures.items()},
         loops=loops,
+        marked=_marked(background),
         n_voting=int(report.trials.votes.sum()),
         costs=_costs(report),
         candidates=_candidates(report),
@@ -111,6 +112,12 @@ def page_of(report: Report, *, title: str = "", names: Names | None = None, sect
         sections=sections,
         docs=_DOCS,
     )
+
+
+def _marked(background: Background | None) -> dict[str, bool]:
+    """Which marks the closed loops have: what their key explains."""
+    marks = () if background is None else tuple(loop.marks for loop in background.loops)
+    return {kind: any(getattr(each, kind) for each in marks) for kind in ("wanted", "limits", "outside")}
 
 
 def _template() -> jinja2.Template:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from mpcoffline.core.text import listed
 from mpcoffline.core.types import Array
 from mpcoffline.plotting import STYLES, controller_label, inline_svg, line_of, new_figure, paper_style
-from mpcoffline.plotting.style import time_unit
+from mpcoffline.plotting.style import BOUND, time_unit
 
 from . import figure
 from .background import Background
 from .loops import Loop
+from .marks import STATE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +27,9 @@ _WIDTH, _HEIGHT, _LOW = 3.5, 2.35, 1.75  # inches
 _MOST_QUANTITIES = 6  # of states, and of inputs, in the closed loops
 _MOST_POINTS = 200  # of a curve
 _TODAY = "#000000"
+_SIGHT = 0.5  # of what a panel shows: a limit farther off would flatten the curves
+WANTED: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 0.9}
+LIMIT: dict[str, Any] = {"linestyle": "-", "linewidth": 0.7}
 #: The figures' colours by those of the page, which are others in the dark.
 COLORS = {
     STYLES["MPC_1"].color: "var(--first)",
@@ -39,8 +44,8 @@ class Picture:
     """A figure in a page.
 
     Attributes:
-        svg: The element.
-        caption: What stands below it.
+        svg: The element; empty where there is nothing to draw.
+        caption: What stands below it, or why there is none.
     """
 
     svg: str
@@ -93,24 +98,36 @@ def loop_panels(loop: Loop, k: int, background: Background) -> Iterator[Picture]
     """
     names = background.names
     rows = [(names.states, loop.states, loop.states_on, False), (names.inputs, loop.actions, loop.actions_on, True)]
+    marks = loop.marks
     for kind, (called, logged, on, held) in enumerate(rows):
         for i in _telling(logged, list(on.values())):
             curves = {name: values[..., i] for name, values in on.items()}
-            caption = f"{called[i]}: {_range_in_words(logged[:, i], curves)}"
-            yield _picture(
-                f"l{k}-{kind}-{i}", _Panel(called[i], logged[:, i], curves, background.dt, held), caption, _LOW
+            wanted = marks.wanted.get(i) if kind == STATE else None
+            panel = _Panel(
+                called[i], logged[:, i], curves, background.dt, held, wanted, marks.limits.get((kind, i), ())
             )
+            yield _picture(f"l{k}-{kind}-{i}", panel, f"{called[i]}: {panel.in_words}.", _LOW)
+    for i in sorted(marks.outside)[:_MOST_QUANTITIES]:
+        course = marks.outside[i]
+        ends = f"from {course[0]:.3g} to {course[-1]:.3g}, between {course.min():.3g} and {course.max():.3g}"
+        panel = _Panel(names.states[i], course, {}, background.dt, held=True)
+        yield _picture(f"l{k}-2-{i}", panel, f"{names.states[i]}, from outside: {ends}.", _LOW)
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """One quantity over time: the log's, and each controller's median model in the band of all models."""
+    """One quantity over time: the log's, and each controller's median model in the band of all models.
+
+    Beside them what it is to follow, and those limits that are in sight of the curves; or a signal alone.
+    """
 
     name: str
     logged: Array
     curves: dict[str, Array]
     dt: float
     held: bool
+    wanted: Array | None = None
+    limits: tuple[Array, ...] = ()
 
     def __call__(self, axes: Axes) -> None:
         n = len(self.logged)
@@ -125,12 +142,28 @@ class _Panel:
             axes.fill_between(times, low, high, step=shape, color=style.color, alpha=0.2, linewidth=0)
             axes.plot(times, middle, drawstyle=drawn, label=controller_label(name), **line_of(style))
         if np.isfinite(self.logged).any():
-            axes.plot(
-                times, self.logged[::step], ":", drawstyle=drawn, color=_TODAY, linewidth=1.2, label="today (log)"
-            )
+            line = ":" if self.curves else "-"  # a signal is the same for the log and in the loops
+            axes.plot(times, self.logged[::step], line, drawstyle=drawn, color=_TODAY, linewidth=1.2)
+        if self.wanted is not None:
+            wanted = self.wanted[:n:step]
+            axes.plot(times, wanted, drawstyle="steps-post", color=_TODAY, zorder=2, **WANTED)
+        low, high = axes.get_ylim()
+        for limit in self.limits:
+            if limit.min() < high + _SIGHT * (high - low) and limit.max() > low - _SIGHT * (high - low):
+                axes.plot(times, limit[:n:step], drawstyle="steps-post", color=BOUND, zorder=1.5, **LIMIT)
         axes.set_title(self.name if self.name.startswith("$") else self.name.replace("$", r"\$"), loc="left")
         axes.set_xlabel(f"time [{name_of_unit}]")
         axes.margins(x=0.0)
+
+    @property
+    def in_words(self) -> str:
+        """For those who do not see the curves: where each ends, and what was wanted there."""
+        parts = [f"{name} ends at {np.median(values[:, -1]):.3g}" for name, values in self.curves.items()]
+        known = self.logged[np.isfinite(self.logged)]
+        parts += [f"the log at {known[-1]:.3g}"] if len(known) else []
+        parts += [f"wanted is {self.wanted[-1]:.3g}"] if self.wanted is not None else []
+        parts += [f"limits are {listed([f'{end[-1]:.3g}' for end in self.limits])}"] if self.limits else []
+        return "; ".join(parts)
 
 
 def _telling(logged: Array, on: list[Array]) -> list[int]:
@@ -142,16 +175,12 @@ def _telling(logged: Array, on: list[Array]) -> list[int]:
     return sorted(order[:_MOST_QUANTITIES].tolist())
 
 
-def _range_in_words(logged: Array, curves: dict[str, Array]) -> str:
-    """For those who do not see the curves: where each ends."""
-    parts = [f"{name} ends at {np.median(values[:, -1]):.3g}" for name, values in curves.items()]
-    known = logged[np.isfinite(logged)]
-    return "; ".join([*parts, f"the log at {known[-1]:.3g}"] if len(known) else parts) + "."
-
-
 def _picture(key: str, draw: Callable[[Axes], None], caption: str, height: float = _HEIGHT) -> Picture:
     with paper_style():
         drawn = new_figure(_WIDTH, height)
         axes = drawn.subplots()
         draw(axes)
+        if not axes.axison:  # it has words alone to say
+            words = " ".join(axes.texts[0].get_text().split())
+            return Picture("", f"{axes.get_title(loc='left').replace('$_{1}$', '_1')}: {words}.")
         return Picture(inline_svg(drawn, key, caption, COLORS), caption)

@@ -21,9 +21,10 @@ from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.behaviour import Behaviour, agreement, stretches
 from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
-from mpcoffline.simulation.starts import returns_along, signals_along
+from mpcoffline.simulation.episodes import Controller
+from mpcoffline.simulation.starts import cheapest_step, returns_along, signals_along
 from mpcoffline.simulation.surroundings import surroundings_of
-from mpcoffline.simulation.trials import Controller, Surroundings
+from mpcoffline.simulation.trials import Surroundings
 
 from .differences import SURE, outvoted
 
@@ -193,7 +194,8 @@ def compared(
     Each stretch of the trial is simulated from its first state, under its signals, on every model that predicts the log
     (:class:`~mpcoffline.simulation.models.LogModels`), under disturbances drawn from the log. The band holds all models
     but one, and two standard deviations of what disturbances, and the sensors' noise in the first state, make of the
-    mean; by how much the models are off for the log's own controller widens it to that side.
+    mean; by how much the models are off for the log's own controller widens it to that side. It does not reach below
+    what the cheapest step, logged or simulated, would cost so many times.
 
     Args:
         learner: What was learned before the trial.
@@ -226,9 +228,13 @@ def compared(
     controllers: dict[str, Controller] = {name: around.seeing(policy) for name, policy in policies.items()}
     controllers[TODAY] = clone
     levels = _levels(around, clone, table, votes, own)
+    done = dict(zip(controllers, around.act(list(controllers.values())), strict=True))
+    floor = steps * min(
+        cheapest_step(tried), around.least, *(float(each.least[votes].min(initial=np.inf)) for each in done.values())
+    )
     predicted = {
-        name: stretched(_band(episodes.cost[votes].reshape(int(votes.sum()), -1, n), levels), widened)
-        for name, episodes in zip(controllers, around.act(list(controllers.values())), strict=True)
+        name: stretched(_band(episodes.cost[votes].reshape(int(votes.sum()), -1, n), levels), widened, floor)
+        for name, episodes in done.items()
     }
     seen = float(np.mean(returns_along(tried, starts, steps)))
     promised = None
@@ -256,10 +262,10 @@ def widening(trials: Iterable[tuple[float | None, float]]) -> float:
     return max(1.0, float(np.sqrt(np.mean(off**2)))) if len(off) else 1.0
 
 
-def stretched(band: Band, factor: float) -> Band:
-    """A band so many times as wide, to either side of its middle."""
+def stretched(band: Band, factor: float, floor: float = -np.inf) -> Band:
+    """A band so many times as wide, to either side of its middle, but not below what can be."""
     low, middle, high = band
-    return middle - factor * (middle - low), middle, middle + factor * (high - middle)
+    return float(np.maximum(middle - factor * (middle - low), floor)), middle, middle + factor * (high - middle)
 
 
 def _surroundings(

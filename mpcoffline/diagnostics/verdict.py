@@ -117,7 +117,7 @@ def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
     """See :class:`Judgement`: the models but one on either side, with two standard errors of a mean over the starts.
 
     And what the median model lets expect by the other regression of the cost, and less what it said too much of the
-    controller that made the log.
+    controller that made the log; but no less than an episode can cost at all.
     """
     costs = trials.of(proposal)[trials.votes][:, whole_episodes(trials)]
     mean, error = paired(costs, np.zeros_like(costs))
@@ -136,7 +136,7 @@ def _expected(trials: Trials, proposal: str) -> tuple[float, float, float]:
         k = off[np.argsort(today.disagreement[off], kind="stable")[len(off) // 2]]
         doubt += SURE * float(today.disagreement_error[k])
         ends += [middle - float(today.disagreement[k]) + sign * doubt for sign in (-1.0, 1.0)]
-    return min(ends), middle, max(ends)
+    return max(min(ends), trials.floor), middle, max(ends)
 
 
 # ---------------------------------------------------------------- sentences
@@ -302,7 +302,8 @@ def _to_see(expected: tuple[float, float, float]) -> str:
 def costs_of(judgement: Judgement, trials: Trials) -> tuple[tuple[str, Array], ...]:
     """Today, MPC_1 and the proposal: lowest, middle and highest mean cost of an episode, ``(3,)`` each."""
     today = judgement.today
-    rows = [("today", today.logged + SURE * today.logged_error * np.array([-1.0, 0.0, 1.0]))]
+    logged = today.logged + SURE * today.logged_error * np.array([-1.0, 0.0, 1.0])
+    rows = [("today", np.maximum(logged, trials.floor))]
     rows.append((trials.names[0], np.array(_expected(trials, trials.names[0]))))
     if judgement.proposal != trials.names[0]:
         rows.append((judgement.proposal, np.array(judgement.expected)))

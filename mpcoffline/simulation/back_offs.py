@@ -15,7 +15,8 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Constraint, StateBounds
 
 from .choice import quick_policy
-from .trials import Episodes, Surroundings
+from .episodes import Episodes
+from .trials import Surroundings
 from .violations import TRIFLE, LimitFunction, limit_functions, moved
 
 _ROUNDS = 6

@@ -16,7 +16,8 @@ from mpcoffline.core.parallel import chosen, n_cpus
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers import SOLVERS, CompilerError
 
-from .trials import Controller, Episodes, Surroundings, Trials
+from .episodes import Controller, Episodes
+from .trials import Surroundings, Trials
 
 FIRST = "MPC_1"
 _SLOW = 10.0  # times as fast as ipopt

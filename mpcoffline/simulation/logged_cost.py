@@ -104,12 +104,17 @@ class LoggedCost:
         cost = self.known.scale * ours + self.known.offset
         return np.asarray(np.where(np.isfinite(cost), cost, self._dearest))
 
+    @property
+    def alike(self) -> bool:
+        """Whether :meth:`second` is the same function."""
+        return self.exact and (self.known is None or not self._others)
+
     def second(self, s: Array, a: Array, reached: Array) -> Array:
         """L by another regression: what both agree on hardly hangs on how L was learned.
 
         It is the same function where that is exact.
         """
-        if self.exact and (self.known is None or not self._others):
+        if self.alike:
             return self(s, a, reached)
         of = reached if self._reached else s
         return self._with_limits(self._others[0](np.hstack([of[:, : self._seen], a])), s, a)

@@ -17,7 +17,8 @@ from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
 from .choice import quick_policy
-from .trials import Episodes, Surroundings
+from .episodes import Episodes
+from .trials import Surroundings
 
 _EVALUATIONS, _TOGETHER = 80, 8
 _STARTS = 24  # of the surroundings that tune; the others judge

@@ -99,6 +99,12 @@ def returns_along(table: TransitionTable, rows: NDArray[np.intp], n_steps: int) 
     return np.where(whole, total[ends + 1] - total[rows], np.nan)
 
 
+def cheapest_step(table: TransitionTable) -> float:
+    """What the cheapest step of a log cost; no more than nothing where an episode has ended, whose rest is free."""
+    columns = table.values()
+    return min(float(columns.costs.min()), 0.0 if np.any(columns.terminations) else np.inf)
+
+
 def costs_before(logged: TransitionTable, table: TransitionTable, rows: NDArray[np.intp], steps: int) -> Array:
     """What the log cost in the first steps of its episodes, which a table with past inputs cannot hold.
 

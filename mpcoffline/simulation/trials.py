@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,10 @@ from mpcoffline.mpc.layout import Layout
 from mpcoffline.mpc.outputs import shown
 from mpcoffline.solvers import Plan
 
+from .episodes import Controller, Episodes
 from .logged_cost import LoggedCost
 from .models import LogModels
-from .starts import returns_along, signals_along
+from .starts import cheapest_step, returns_along, signals_along
 
 _ARRAYS = {
     "votes": "b",
@@ -42,13 +43,6 @@ _ROUNDING = 1e-12  # of what an episode costs
 _RUN_AWAY = 30.0  # spreads of the data: a state this far out has left what any model of them knows
 
 
-class Controller(Protocol):
-    """What acts, as :class:`~mpcoffline.control.policy.MPCPolicy` does."""
-
-    def predict(self, observation: Any, state: Any = None) -> tuple[NDArray[Any], Any]:
-        """Inputs ``(B, nu)`` for observations ``(B, ny)``, or outputs, and what the next call wants to know."""
-
-
 @dataclass(frozen=True)
 class Trials:
     """Costs of controllers in closed loop with models of a log, ``(controllers, models, starts)``.
@@ -65,6 +59,8 @@ class Trials:
         begun: The starts at which an episode of the log began, ``(starts,)``.
         judged: The starts that had no part in the choice among the controllers, ``(starts,)``.
         n_steps: Length of an episode.
+        least: What the cheapest step cost, logged or simulated by a model with a vote, ``(1,)``; minus infinity where
+            nobody has looked, as in files.
     """
 
     names: tuple[str, ...]
@@ -78,6 +74,7 @@ class Trials:
     begun: NDArray[np.bool_]
     judged: NDArray[np.bool_]
     n_steps: int
+    least: Array = field(default_factory=lambda: np.full(1, -np.inf))
 
     @classmethod
     def none(cls, names: Sequence[str], around: Surroundings) -> Trials:
@@ -87,7 +84,7 @@ class Trials:
         models, rows, returns = around.models, around.rows, around.returns
         judged = np.ones(len(around.rows), dtype=bool)
         parts = cost, second, lost, rows, returns, around.begun, judged, around.n_before + around.n_steps
-        return cls(tuple(names), models.names, models.votes, *parts)
+        return cls(tuple(names), models.names, models.votes, *parts, np.array([around.least]))
 
     def fill(
         self, controllers: Mapping[str, Controller], around: Surroundings, starts: slice, kept: int = 0
@@ -103,6 +100,12 @@ class Trials:
             k, before = self.names.index(name), around.before[starts]
             self.cost[k, :, starts], self.second[k, :, starts] = episodes.cost + before, episodes.second + before
             self.lost[k, :, starts] = episodes.lost
+            self.least[0] = episodes.least[self.votes].min(initial=self.least[0])
+
+    @property
+    def floor(self) -> float:
+        """What an episode costs at least: as much as if each of its steps were the cheapest one."""
+        return self.n_steps * float(self.least[0])
 
     def with_names(self, more: Sequence[str]) -> Trials:
         """With further controllers, not tried yet."""
@@ -169,29 +172,6 @@ class Trials:
         return cls(names=names, models=models, n_steps=int(arrays["n_steps"]), **parts)
 
 
-@dataclass(frozen=True)
-class Episodes:
-    """A controller in closed loop with each model from each start.
-
-    Attributes:
-        cost: ``(models, starts)``, as in :class:`Trials`.
-        second: Likewise.
-        lost: Likewise.
-        states: States with the first model, past inputs included, ``(starts, T + 1, nx)``.
-        actions: Inputs with the first model, ``(starts, T, nu)``.
-        states_kept: States with every model, ``(models, kept, T + 1, nx)``, of the first starts, as many as were asked.
-        actions_kept: Inputs with every model, ``(models, kept, T, nu)``.
-    """
-
-    cost: Array
-    second: Array
-    lost: NDArray[np.bool_]
-    states: Array
-    actions: Array
-    states_kept: Array
-    actions_kept: Array
-
-
 class Surroundings:
     """All that happens to a controller in a trial but for what it does itself: the same for all controllers.
 
@@ -220,6 +200,7 @@ class Surroundings:
     usual: int
     n_before: int
     fresh: bool
+    least: float
 
     def __init__(
         self,
@@ -259,6 +240,7 @@ class Surroundings:
         reach = np.abs(states - self._middle).max(axis=0) + _RUN_AWAY * spread
         self._reach = np.where((spread > 0.0) & (np.arange(len(reach)) < layout.n_states), reach, np.inf)
         self._dearest = float((columns if paid is table else paid.values()).costs.max())
+        self.least = cheapest_step(paid)
 
     def on(self, models: NDArray[np.intp]) -> Surroundings:
         """The same with some of the models, by number."""
@@ -312,6 +294,7 @@ class Surroundings:
         x = np.broadcast_to(begun, (*shape, begun.shape[1])).copy()
         lost, over, good = (np.zeros(shape, dtype=bool) for _ in range(3))
         total, second, states, actions = np.zeros(shape), np.zeros(shape), [x[0].copy()], []
+        least = np.full(shape[:2], np.inf)
         states_kept, actions_kept = [x[:, :, :kept].copy()], []
         acted = np.full((*shape, len(self._layout.acting)), np.nan)  # nothing, yet
         courses = [self._course(controller, x[:, i], starts) for i, controller in enumerate(controllers)]
@@ -329,13 +312,17 @@ class Surroundings:
             reached[..., :n] += disturbances[:, None, :, k]
             reached[..., n:ny] = signals[:, k]
             steps = *flat, reached.reshape(flat[0].shape)
-            for costs, function in ((total, self.cost), (second, self.cost.second)):
-                costs += np.where(over, 0.0, np.where(lost, self._dearest, function(*steps).reshape(shape)))
+            priced = self.cost(*steps)
+            for costs, each in ((total, priced), (second, priced if self.cost.alike else self.cost.second(*steps))):
+                now = np.where(over, 0.0, np.where(lost, self._dearest, each.reshape(shape)))
+                costs += now
+                np.minimum(least, now.min(axis=2), out=least)
             ended = self.cost.ended(*steps).reshape(shape) & ~lost & ~over
             if ended.any():
                 paid = self.cost.ends.paid(reached[ended])
                 total[ended] += paid
                 second[ended] += paid
+                least = np.minimum(least, min(0.0, float(paid.min())))
                 good[ended] = paid < self.cost.ends.good_below
             over |= ended
             lost |= ~(np.abs(reached - self._middle) < self._reach).all(axis=-1) & ~over
@@ -346,10 +333,13 @@ class Surroundings:
             states_kept.append(x[:, :, :kept].copy())
             actions_kept.append(u[:, :, :kept].copy())
         lost |= over & ~good
-        parts = np.stack(states, axis=2), np.stack(actions, axis=2)
-        kept_parts = np.stack(states_kept, axis=3), np.stack(actions_kept, axis=3)
+        seen, done = np.stack(states, axis=2), np.stack(actions, axis=2)
+        kept_states, kept_actions = np.stack(states_kept, axis=3), np.stack(actions_kept, axis=3)
         return [
-            Episodes(total[:, i], second[:, i], lost[:, i], *(e[i] for e in parts), *(e[:, i] for e in kept_parts))
+            Episodes(
+                *(total[:, i], second[:, i], lost[:, i], seen[i], done[i]),
+                *(kept_states[:, i], kept_actions[:, i], least[:, i]),
+            )
             for i in range(c)
         ]
 

@@ -22,6 +22,7 @@ from mpcoffline.plants import BlackBoxPlant, Plant
 
 from .covered import coverage, gain, goal, quiet, readable, sampling
 from .determined import in_words, parameters
+from .moves import unstated_rates
 from .output_check import check_outputs
 from .page import Kind, LogCheck
 
@@ -70,6 +71,7 @@ def check_log(
         found.add("problem", "description and data", str(finding), forbids=finding in findings.errors)
     if (table.ny, table.nu) == (mpc.ny, mpc.nu):
         coverage(plant, table, found)
+        unstated_rates(plant, table, found)
         goal(plant, mpc, table, found)
     misread = any(finding.misread for finding in findings.findings)
     if misread:

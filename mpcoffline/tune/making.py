@@ -137,7 +137,7 @@ def made(order: Order, place: Workplace, tell: Tell, *, show_progress: bool) -> 
 def _calibrated(report: Report, widened: float) -> Report:
     """The report with the band that trials before have shown to be right."""
     judgement = report.judgement
-    low, middle, high = expected = stretched(judgement.expected, widened)
+    low, middle, high = expected = stretched(judgement.expected, widened, report.trials.floor)
     if widened == 1.0 or not np.isfinite(expected).all():
         return report
     said = (

@@ -18,6 +18,7 @@ from mpcoffline.plants import Plant
 
 from .covered import coverage, gain, goal, quiet, readable, sampling
 from .determined import DETERMINED, FAR, SURE, WEAK
+from .moves import unstated_rates
 from .page import LogCheck
 
 _STRANGE = 4.0  # standard deviations of where episodes begin, as described
@@ -31,6 +32,7 @@ def check_outputs(plant: Plant, table: TransitionTable, *, seed: int, tell: Call
     readable(table, found)
     tell("units")
     coverage(plant, table, found)
+    unstated_rates(plant, table, found)
     _contradictions(plant, table, found)
     if any(each.forbids for each in found.remarks):
         found.sort()

@@ -44,6 +44,23 @@ def test_applied_inputs_travel_and_decide() -> None:
         y = mpc.model(z, action)[:2]
 
 
+def test_what_is_usual_is_asked_only_where_nothing_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finding it takes as long as a solve of a small problem."""
+    policy, y = MPCPolicy(make_mpc()), np.array([2.0, -1.0])
+    _, state = policy.predict(y)
+    expected, asked, usual = policy.predict(y, state=state)[0], [], MPC.usual_input.fget
+
+    def counted(mpc: MPC) -> Any:
+        asked.append(mpc)
+        return usual(mpc)
+
+    monkeypatch.setattr(MPC, "usual_input", property(counted))
+    np.testing.assert_array_equal(policy.predict(y, state=state)[0], expected)
+    assert asked == []
+    policy.predict(y, state=state, episode_start=True)
+    assert len(asked) == 1
+
+
 def test_noise_and_clipping_are_remembered() -> None:
     space = spaces.Box(np.float32([-0.05, -1.0]), np.float32([0.05, 1.0]))
     policy = MPCPolicy(make_mpc(1), action_space=space, exploration_noise=0.3, seed=3)

@@ -12,7 +12,7 @@ from mpcoffline import TransitionTable
 from mpcoffline.diagnostics.limits import LimitCheck, limit_checks, with_limits
 from mpcoffline.diagnostics.verdict import Judgement
 from mpcoffline.mpc import MPC, Constraint, Model, Penalty, QuadraticCost, StateBounds
-from mpcoffline.simulation.trials import Episodes
+from mpcoffline.simulation.episodes import Episodes
 
 POWER = Constraint(lambda x, u, p: ca.vertcat(x[0] * u[0] - p["most"], -x[0] * u[0] - 9.0), "power", Penalty(2.0, 0.5))
 LEVEL = StateBounds([-np.inf, -1.0], [0.5, 1.0], "level")
@@ -30,7 +30,7 @@ def run(x: list[float], u: list[float], n: int = 4) -> Episodes:
     states[:, :, 0] = x
     nothing = np.zeros((1, n))
     actions = np.tile(np.array(u)[None, :, None], (n, 1, 1))
-    return Episodes(nothing, nothing, nothing > 0.0, states, actions, states[None], actions[None])
+    return Episodes(nothing, nothing, nothing > 0.0, states, actions, states[None], actions[None], np.zeros(1))
 
 
 def log_of(x: list[float], u: list[float]) -> TransitionTable:

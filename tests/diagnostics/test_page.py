@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.diagnostics import Names
 from mpcoffline.diagnostics.limits import LimitCheck
 from mpcoffline.diagnostics.loops import _chosen
+from mpcoffline.diagnostics.marks import Marks
+from mpcoffline.diagnostics.measures import ValueCheck
 from mpcoffline.diagnostics.page import number, page_of, pair, prose
 
 ODD = '<script>alert("1")</script>&amp;'
@@ -114,6 +117,45 @@ def test_other_names_take_the_place_of_numbers(tmp_path: Path) -> None:
     assert report.html(tmp_path / "again.html", names=Names(("a", "b"), ("c",), plant="Tank")).read_text() == text
     with pytest.raises(InvalidArgumentError, match=r"names.states: expected 2 names, got 1"):
         report.html(path, names=Names(("a",), ("c",)))
+
+
+def test_what_has_nothing_to_show_is_a_sentence_and_no_empty_picture() -> None:
+    """As where episodes are too short for V to be compared with what it cost."""
+    report = replace(report_of(GOOD), value=ValueCheck(0, np.nan, np.nan, np.nan, np.nan))
+    found = BeautifulSoup(page_of(replace(report, background=background())), "html.parser")
+    pictures = {svg["aria-label"].split()[0] for svg in found("svg")}
+    assert len(found("svg")) == 5 + 3
+    assert "V" not in pictures
+    said = "V of the last episodes: no episode is long enough for a measured return."
+    assert said in [" ".join(tag.get_text().split()) for tag in found("p")]
+    assert all(svg("path") and svg("use") for svg in found("svg"))
+
+
+def test_set_points_limits_and_signals_stand_beside_the_loops() -> None:
+    course = np.linspace(0.2, 0.4, 51)
+    marks = Marks({0: course}, {(0, 0): (np.full(51, 0.9), np.full(51, 70.0))}, {1: 2.0 * course})
+    plain = background()
+    marked = replace(plain, loops=(replace(plain.loops[0], marks=marks),))
+    before, after = (
+        BeautifulSoup(page_of(replace(report_of(GOOD), background=each)), "html.parser") for each in (plain, marked)
+    )
+    key, bare = (" ".join(each.find(class_="key").get_text(" ").split()) for each in (after, before))
+    assert key.endswith("today (log) set-point limit from outside")
+    assert bare.endswith("today (log)")
+    level, flow, _, outside = (panel.svg for panel in after(class_="panel"))
+    assert level["aria-label"].endswith("wanted is 0.4; limits are 0.9, 70.")
+    assert outside["aria-label"] == "flow [l/s], from outside: from 0.4 to 0.8, between 0.4 and 0.8."
+    assert "wanted" not in flow["aria-label"]
+    was = before.find(class_="panel").svg
+    # One dashed line more for the set-point, and one for the limit in sight; that at 70 would flatten the curves.
+    assert len(lines_of(level)) == len(lines_of(was)) + 2
+    assert len(after(class_="panel")) == len(before(class_="panel")) + 1
+
+
+def lines_of(svg: Any) -> list[Any]:
+    """Curves, without the grid and the axes' lines."""
+    axes = svg.find(id=re.compile(r"axes_1$"))
+    return list(axes(id=re.compile(r"line2d_\d+$"), recursive=False))
 
 
 def test_numbers_are_written_for_readers() -> None:

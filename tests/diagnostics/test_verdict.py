@@ -155,6 +155,26 @@ def test_one_runaway_in_the_log_does_not_make_today_unclear() -> None:
     assert 70.0 < low < middle < high < 90.0
 
 
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-3, -50.0), (1e4, 1e6)])
+def test_no_band_reaches_below_what_an_episode_costs_at_least(scale: float, offset: float) -> None:
+    """A clone costs 20 more than the log did, and so the proposal, of 15, may cost 20 less: as if that were possible.
+
+    With steps of 0.1 at least an episode of 50 costs 5 or more, in any unit, and whatever zero the cost has.
+    """
+    tried = trials({"learned": [85.0] * 8}, today=20.0, clone=40.0)
+    per_step = offset / tried.n_steps
+    cost = {name: scale * getattr(tried, name) + offset for name in ("cost", "second", "returns")}
+    known = replace(tried, **cost, least=np.array([scale * 0.1 + per_step]))
+    low, middle, high = decide(known, "learned").expected
+    assert low == pytest.approx(scale * 5.0 + offset)
+    assert middle == pytest.approx(scale * 15.0 + offset, abs=scale)
+    unknown = decide(replace(known, least=np.full(1, -np.inf)), "learned").expected
+    assert unknown[0] < offset
+    assert unknown[1:] == (middle, high)
+    for _, band in costs_of(decide(known, "learned"), known):
+        assert (band[np.isfinite(band)] >= scale * 5.0 + offset - 1e-9 * scale).all()
+
+
 def test_today_is_unknown_where_the_log_is_shorter() -> None:
     found, why = judge(trials({"learned": BETTER}))
     assert found == "recommend"

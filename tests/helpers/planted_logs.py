@@ -248,10 +248,25 @@ def defects() -> Iterator[Case]:
         ("a coarse sensor", "tanks", _coarse, ("h2 comes in steps",)),
         ("an input in another order", "heater", _shuffled, ("power", "does something")),
         ("an input at its bounds", "motor", lambda: logged("motor", 16, explore=20.0), ("v is at its bounds",)),
+        ("an actuator that moves slowly", "heater", _sluggish, ("power never changes by more than 8 %", "rate=8")),
         ("a goal that was never reached", "heater", lambda: logged("heater", 17, pump=_cold), ("T is never nearer",)),
     ]
     for case in cases:
         yield Case(*case)
+
+
+def _sluggish() -> Columns:
+    """Its controller asks for more than an actuator can, which moves by 8 % in a control interval."""
+    rng, at, wanted = np.random.default_rng(18), [50.0], [55.0]
+
+    def moved(k: int, x: Any) -> float:
+        if rng.random() < 0.1:
+            wanted[0] = float(rng.uniform(40.0, 70.0))
+        asked = float(np.clip(45.0 + 4.0 * (wanted[0] - x[0]), 0.0, 100.0))
+        at[0] += float(np.clip(asked - at[0], -8.0, 8.0))
+        return at[0]
+
+    return logged("heater", 18, pump=moved)
 
 
 def _cold(k: int, x: Any) -> float:

@@ -16,7 +16,7 @@ from mpcoffline.diagnostics.limits import limit_checks
 from mpcoffline.learner.candidates import FULL
 from mpcoffline.mpc import MPC, StateBounds
 from mpcoffline.simulation.choice import FIRST
-from mpcoffline.simulation.trials import Episodes
+from mpcoffline.simulation.episodes import Episodes
 
 QUICK: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "quadratic", "seed": 0}
 LOG = episodes(n=40, steps=30)
@@ -44,7 +44,9 @@ def test_all_candidates_are_softened_and_the_report_says_so(tmp_path: Path) -> N
     assert f"'room' at l1 = {price(learner.mpc):.3g}" in told
     nothing = np.zeros((1, 2))
     still = np.zeros((2, 4, 2))
-    loop = Episodes(nothing, nothing, nothing > 0.0, still, still[:, 1:, :1], still[None], still[None, :, 1:, :1])
+    loop = Episodes(
+        nothing, nothing, nothing > 0.0, still, still[:, 1:, :1], still[None], still[None, :, 1:, :1], np.zeros(1)
+    )
     (check,) = limit_checks(LIMITED, LOG, loop, loop, learner.mpc)
     assert check.kind == f"hard, handed out with l1 = {price(learner.mpc):.3g}"
     learner.save(tmp_path / "l.zip")

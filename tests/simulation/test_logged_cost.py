@@ -82,6 +82,7 @@ def test_a_cost_with_kinks_has_norms_and_so_has_the_check(of_kinked: LoggedCost)
     errors = [(f(*STEPS_OF) - kinked(*POINTS)).std() / spread for f in (of_kinked, of_kinked.second)]
     assert max(errors) < 0.1
     assert 1.0 - of_kinked.r2 == pytest.approx(max(errors) ** 2, abs=0.01)
+    assert not of_kinked.alike
     assert not np.array_equal(of_kinked(*STEPS_OF), of_kinked.second(*STEPS_OF))
 
 
@@ -168,6 +169,7 @@ def test_weights_of_the_mpc_that_are_not_those_of_the_log() -> None:
         cost = LoggedCost(table, mpc=mpc)
         assert cost.exact
         np.testing.assert_allclose(cost(x, u, x), expected, rtol=1e-3)
+        assert cost.alike
         np.testing.assert_array_equal(cost.second(x, u, x), cost(x, u, x))
         assert "the MPC's own stage cost" in str(cost)
 

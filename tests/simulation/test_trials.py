@@ -26,7 +26,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.simulation.choice import FIRST, choose, various_first
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
-from mpcoffline.simulation.starts import costs_before, initial_rows, returns_along
+from mpcoffline.simulation.starts import cheapest_step, costs_before, initial_rows, returns_along
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Surroundings, Trials
 
@@ -64,6 +64,26 @@ def test_a_trial_is_the_closed_loop_of_the_optimal_gain() -> None:
     assert some.states_kept.shape[1] == 0
 
 
+def test_what_an_episode_costs_at_least_is_known_from_its_steps() -> None:
+    """The cheapest step of log and simulation, times the steps; an episode that may end costs nothing afterwards."""
+    around = place(TRUE_MPC, LOG, [0, 30, 60], 40)
+    assert around.least == cheapest_step(LOG) == pytest.approx(float(LOG.costs.min()))
+    trials = Trials.none(["MPC_1"], around)
+    assert trials.floor == 40 * around.least
+    done = trials.fill({"MPC_1": MPCPolicy(TRUE_MPC)}, around, slice(None))["MPC_1"]
+    x, u = done.states, done.actions
+    steps = [around.cost(x[:, k], u[:, k], x[:, k + 1]) for k in range(40)]
+    assert done.least[0] == pytest.approx(float(np.min(steps)), rel=1e-9)
+    assert trials.floor == pytest.approx(40 * min(around.least, float(done.least[0])))
+    assert (trials.floor <= trials.cost).all()
+    assert Trials.from_arrays(trials.names, trials.models, trials.to_arrays()).floor == -np.inf  # nobody has looked
+    columns = LOG.values()
+    ends = np.zeros(len(LOG), dtype=bool)
+    ends[-1] = True
+    parts = columns.observations, columns.actions, columns.costs + 5.0, columns.next_observations
+    assert cheapest_step(TransitionTable.from_arrays(*parts, ends)) == 0.0
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller_states(share: float) -> None:
     """Against a loop of its own: a Kalman filter from where episodes begin, and the same noise for each controller."""
@@ -78,9 +98,8 @@ def test_behind_sensors_an_mpc_sees_outputs_and_a_clone_of_the_logged_controller
     controller = around.seeing(MPCPolicy(TRUE_MPC))
     assert isinstance(controller, OutputFeedbackPolicy)
     behind, seeing = around.act([controller, MPCPolicy(TRUE_MPC)], kept=3)
-    np.testing.assert_allclose(
-        seeing.cost, plain.act([MPCPolicy(TRUE_MPC)])[0].cost, rtol=1e-13
-    )  # sums of other shapes
+    # The same but for rounding: costs of a batch of another size are summed in another order.
+    np.testing.assert_allclose(seeing.cost, plain.act([MPCPolicy(TRUE_MPC)])[0].cost, rtol=1e-13)
     for m in range(len(models)):
         x, state, expected = LOG.observations[rows].astype(np.float64), None, np.zeros(3)
         policy = OutputFeedbackPolicy(MPCPolicy(TRUE_MPC), sensors.observer(TRUE_MPC))

@@ -136,6 +136,8 @@ def test_bands_become_as_wide_as_trials_were_off() -> None:
     assert widening([]) == widening([(None, 1.0), (np.inf, 1.0)]) == widening([(0.4, 1.0), (-0.9, 1.0)]) == 1.0
     assert widening([(-3.0, 1.0), (1.0, 2.0), (None, 5.0)]) == pytest.approx(np.sqrt(6.5))
     assert stretched((9.0, 10.0, 14.0), 2.0) == (8.0, 10.0, 18.0)
+    assert stretched((9.0, 10.0, 14.0), 2.0, floor=8.5) == (8.5, 10.0, 18.0)
+    assert np.isnan(stretched((np.nan, np.nan, np.nan), 2.0, floor=8.5)).all()
     found = replace(calibration(11.0, 9.0, 11.0, 13.0), widened=2.5)
     assert Calibration.from_json(json.loads(json.dumps(found.to_json()))) == found
 

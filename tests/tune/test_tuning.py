@@ -175,15 +175,22 @@ def test_the_command_tells_what_it_does_and_ends_with_what_to_do(
     file.write_text("from planted_logs import heater\nplant = heater()\n")
     log.write_text("power,T,ambient\n" + "\n".join(f"{20 + 5 * (i % 7)},{30 + i % 5},20" for i in range(30)))
     given: dict[str, Any] = {}
+    now = [0.0]
 
     def stand_in(plant: Any, table: Any, out: Path, **options: Any) -> Tuned:
         given.update(options, rows=len(table))
+        options["tell"]("Fitting")
+        now[0] += 61.0
         return Tuned.load(once.folder)
+
+    monkeypatch.setattr("mpcoffline.core.progress.monotonic", lambda: now[0])
 
     monkeypatch.setattr("mpcoffline.tune.tune", stand_in)
     result = CliRunner().invoke(app, ["tune", str(file), str(log), "--preset", "best", "--seed", "3"])
     assert result.exit_code == 0, result.output
     assert result.stderr.startswith("Reading log.csv\n29 control intervals of 5 s")
+    assert result.stderr.endswith("\nFitting\nFitting (61 s, 61 s in all)\n")  # no terminal: plain lines
+    assert result.stderr.replace("\n", "").isprintable()
     assert result.stdout.startswith("Verdict: recommend\n")
     assert (given["preset"], given["seed"], given["rows"]) == ("best", 3, 29)
     document = json.loads(CliRunner().invoke(app, ["tune", str(file), str(log), "--json"]).stdout)
