@@ -23,7 +23,7 @@ _ROWS_A_NUMBER, _DIRECTIONS = 2, 6
 _RANDOM = 100
 _WORTH_MORE = 0.8  # times the squared error, for which all states are taken
 _TRIFLE = 1e-3  # of the variance
-_EXACT = 1e-10  # share of the variance: true norms end below 1e-14, what some norms resemble above 1e-8
+_EXACT = 1e-12  # share of the variance: true norms end below 1e-14, what some norms resemble above 1e-11
 _ROUNDED = 0.03  # of the size of a norm: how its kink is rounded in a plan
 
 
