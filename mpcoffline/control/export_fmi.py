@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import platform
+import subprocess
 import sys
 import threading
 import xml.etree.ElementTree as ET
@@ -180,7 +181,11 @@ def _library(sources: list[str]) -> dict[str, bytes]:
     said = "no C compiler"
     for compiler in compilers() if system else []:
         flags = ("-std=gnu11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-w", "-I.")
-        done = run_bounded([*split(compiler), *flags, *sources, "-o", "library", "-lm"], timeout=_SECONDS)
+        try:
+            done = run_bounded([*split(compiler), *flags, *sources, "-o", "library", "-lm"], timeout=_SECONDS)
+        except subprocess.TimeoutExpired:
+            said = f"{compiler}: no result within {_SECONDS:.0f} s"
+            continue
         if system and done.returncode == 0:
             machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(platform.machine(), platform.machine())
             return {f"binaries/{machine}-{system[0]}/{_NAME}{system[1]}": Path("library").read_bytes()}

@@ -210,9 +210,10 @@ def quick_policy(mpc: MPC) -> MPCPolicy:
     """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem.
 
     It takes as many threads as torch does, which change no digit. Without limits its solves end within 1e-8 of the
-    cost, or after 60 iterations: where Gauss-Newton creeps, as on learned residuals, the rest is half of the time and
-    changes no closed loop's cost by what models of the log can tell. Few are retried: an MPC of which many fail is no
-    good one. What fails is counted, and told by those who ask; it is no warning, since nothing real moves.
+    cost, or after 60 iterations: where Gauss-Newton creeps, as on learned residuals, the rest is half of the time.
+    Where plans have several minima, as in swing-ups, another may be found than on the plant. Few are retried: an MPC of
+    which many fail is no good one. What fails is counted, and told by those who ask; it is no warning, since nothing
+    real moves.
     """
     if "ddp" in SOLVERS and not SOLVERS["ddp"].refuses(mpc):
         nearness: dict[str, Any] = (
