@@ -1,9 +1,13 @@
-"""How many threads numpy's matrices get."""
+"""How many threads numpy's matrices get, and work that several threads share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -17,3 +21,17 @@ def one_blas_thread() -> Iterator[None]:
 
     with threadpool_limits(1, user_api="blas"):
         yield
+
+
+def side_by_side(jobs: Sequence[Callable[[], T]]) -> list[T]:
+    """What some jobs give, in their order, done by as many threads as torch has.
+
+    For what waits for numpy's matrices, which let other threads run. Jobs share nothing that one of them changes.
+    """
+    import torch
+
+    workers = min(torch.get_num_threads(), len(jobs))
+    if workers < 2:
+        return [job() for job in jobs]
+    with ThreadPoolExecutor(workers) as pool:
+        return [done.result() for done in [pool.submit(job) for job in jobs]]

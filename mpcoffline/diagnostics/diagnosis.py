@@ -124,7 +124,7 @@ def diagnose(
         original,
         logged,
         found,
-        slow=are_slow(policies.values()),
+        are_slow=lambda: are_slow(policies.values()),
         n_starts=n_starts,
         n_steps=n_steps,
         seed=seed + _FRESH,

@@ -284,7 +284,7 @@ def _surroundings(
     """
     log, table, clean = logs
     loops = _FEW_LOOPS if slow else _LOOPS
-    usual = surroundings_of(learned, given, log, found, slow=slow, n_starts=1, seed=seed, sensors=sensors)
+    usual = surroundings_of(learned, given, log, found, are_slow=lambda: slow, n_starts=1, seed=seed, sensors=sensors)
     rng, longest = np.random.default_rng(seed), int(table.episodes.lengths.max())
     steps = min(usual.n_steps + usual.n_before, longest, int(tried.episodes.lengths.max()))
     starts = _stretches(tried, steps, min(_WINDOWS, loops // 2))

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from mpcoffline.core.threads import side_by_side
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.mpc import MPC
@@ -128,7 +130,7 @@ def fit_residual(mpc: MPC, table: TransitionTable, seed: int = 0) -> Residual:
     judged = HeldOut.of(missed.episodes, seed).rows
     outputs = np.sqrt(np.mean(np.clip(missed.errors, -_ABSURD, _ABSURD) ** 2, axis=0)) > _LEAST
     while outputs.any():
-        residual = missed.learned(~judged, outputs, np.random.default_rng(seed))
+        residual = missed.learned(~judged, outputs, _drawn(np.random.default_rng(seed)))
         better = missed.gains(residual, judged)
         keep = outputs & better
         if (keep == outputs).all():
@@ -151,19 +153,31 @@ def fit_residuals(mpc: MPC, table: TransitionTable, seed: int = 0, *, count: int
     """
     missed, rng = _Missed.of(mpc, plant_rows(mpc, table), seed), np.random.default_rng(seed)
     outputs = np.sqrt(np.mean(np.clip(missed.errors, -_ABSURD, _ABSURD) ** 2, axis=0)) > _LEAST
-    if not outputs.any():
+    if not count or not outputs.any():
         return (Residual(None, outputs, missed.unit),) * count
     ids, group = np.unique(missed.episodes, return_inverse=True)
     if len(ids) < _FEW:
         group = np.arange(len(group)) * 20 // len(group)
-    effort, found = Effort(rows=_DRAWN, steps=_STEPS), list[Residual]()
+    members = list[tuple[_Missed, tuple[int, int]]]()
     for _ in range(count):
         drawn = rng.integers(group.max() + 1, size=group.max() + 1)
         rows = np.concatenate([np.flatnonzero(group == k) for k in drawn])
-        found.append(missed.at(rows).learned(np.ones(len(rows), dtype=bool), outputs, rng, effort))
-        if (network := found[0].network) is not None:
-            effort = effort._replace(decays=(network.decay,))  # the next ones would choose the same
-    return tuple(found)
+        members.append((missed.at(rows), _drawn(rng)))
+    effort = Effort(rows=_DRAWN, steps=_STEPS)
+
+    def learned(member: tuple[_Missed, tuple[int, int]], effort: Effort) -> Residual:
+        own, seeds = member
+        return own.learned(np.ones(len(own.errors), dtype=bool), outputs, seeds, effort)
+
+    first = learned(members[0], effort)
+    if first.network is not None:
+        effort = effort._replace(decays=(first.network.decay,))  # the next ones would choose the same
+    return first, *side_by_side([partial(learned, member, effort) for member in members[1:]])
+
+
+def _drawn(rng: np.random.Generator) -> tuple[int, int]:
+    """Seeds of the rows that say when to stop, and of the network."""
+    return int(rng.integers(2**31)), int(rng.integers(2**31))
 
 
 @dataclass(frozen=True)
@@ -199,14 +213,14 @@ class _Missed:
         self,
         rows: NDArray[np.bool_],
         outputs: NDArray[np.bool_],
-        rng: np.random.Generator,
+        seeds: tuple[int, int],
         effort: Effort | None = None,
     ) -> Residual:
         """The network of some of the rows; a quarter of their episodes says when to stop."""
-        stop = HeldOut.of(self.episodes[rows], int(rng.integers(2**31))).rows
+        stop = HeldOut.of(self.episodes[rows], seeds[0]).rows
         inputs, errors = self.inputs[rows], self.errors[rows][:, outputs]
         parts = ((inputs[part], errors[part]) for part in (~stop, stop))
-        return Residual(fit_small_network(next(parts), next(parts), HIDDEN, rng, effort), outputs, self.unit)
+        return Residual(fit_small_network(next(parts), next(parts), HIDDEN, seeds[1], effort), outputs, self.unit)
 
     def gains(self, residual: Residual, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which states are predicted better on these rows, beyond chance, ``(nx,)``."""

@@ -112,7 +112,7 @@ def fit_small_network(
     data: tuple[Array, Array],
     stop: tuple[Array, Array],
     hidden: tuple[int, int],
-    rng: np.random.Generator,
+    seed: int,
     effort: Effort | None = None,
 ) -> SmallNetwork:
     """The network nearest to targets in mean square, by Levenberg and Marquardt (doi:10.1137/0111030).
@@ -124,19 +124,19 @@ def fit_small_network(
         data: Inputs ``(rows, n)`` and targets ``(rows, m)``, of which errors of one size mean the same.
         stop: Rows held out.
         hidden: Widths.
-        rng: Draws weights and rows.
+        seed: Draws weights and rows.
         effort: Rows, steps, and the pulls that are tried.
     """
     effort = effort or Effort()
     gate = Gate.of(data[0])
     limit = np.maximum(_REACH * np.abs(data[1]).max(axis=0), np.finfo(np.float64).tiny)
     (z, open_), (z_stop, open_stop) = (gate.standardised(part[0]) for part in (data, stop))
-    sizes, draw = (z.shape[1], *hidden, data[1].shape[1]), int(rng.integers(2**31))
+    sizes = (z.shape[1], *hidden, data[1].shape[1])
     batches, size = (z, open_[:, None] * limit, data[1]), float(np.mean(data[1] ** 2))
     held_out = z_stop, open_stop[:, None] * limit, stop[1]
 
     def descended(decay: float) -> tuple[Layers, float]:
-        return _descended(sizes, batches, held_out, decay * size, np.random.default_rng(draw), effort)
+        return _descended(sizes, batches, held_out, decay * size, np.random.default_rng(seed), effort)
 
     chosen = effort.decays[0]
     best, error = descended(chosen)

@@ -271,7 +271,8 @@ def tried(
     mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    with Ahead(torch.get_num_threads() - 1) as ahead:
+    threads = torch.get_num_threads()
+    with Ahead(threads if threads > 1 else 0) as ahead:
         ahead.start(mpcs.values())
 
         def variants_ahead(good: Mapping[str, MPC], turn: int) -> Mapping[str, MPC]:
@@ -279,9 +280,16 @@ def tried(
             ahead.start(found.values())
             return found
 
-        slow = are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL]))
-        asked: dict[str, Any] = {"slow": slow, "choosing": True, "seed": known.seed, "sensors": sensors}
-        around = surroundings_of(known.mpc, nominal, table, known.found, **asked)
+        around = surroundings_of(
+            known.mpc,
+            nominal,
+            table,
+            known.found,
+            are_slow=lambda: are_slow(quick_policy(mpc) for mpc in (mpcs[FIRST], mpcs[FULL])),
+            choosing=True,
+            seed=known.seed,
+            sensors=sensors,
+        )
         around = various_first(around, mpcs[FIRST])
         trials, chosen = choose(mpcs, around, variants_ahead, tell, FULL)
     seconds, steps = {"the regressions": learned_in, "the choice": core_seconds() - begun}, [FIRST, FULL, chosen]

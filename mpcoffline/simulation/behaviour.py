@@ -291,7 +291,8 @@ def _regression(
     parts = ((x[part], left[part]) for part in (~held_out, held_out))
     network: SmallNetwork | None = None
     if float(np.mean(_per_row(u - linear(x), u))) > _EXACT:
-        network = fit_small_network(next(parts), next(parts), _HIDDEN, np.random.default_rng(seed), _EFFORT)
+        drawn = int(np.random.default_rng(seed).integers(2**31))
+        network = fit_small_network(next(parts), next(parts), _HIDDEN, drawn, _EFFORT)
 
     def both(at: Array) -> Array:
         found = linear(at)

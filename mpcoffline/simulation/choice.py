@@ -29,6 +29,8 @@ _RETRIED = 0.1  # of the solves
 _JUDGED = 3  # of the best at most, one after the other
 _NEAR, _ITERATIONS = 1e-8, 60  # tolerance and iterations of simulated solves; a plant's own are nearer to the minimum
 _VARIED = (3, 1)  # of so many of the best, variants are tried after each of the first rounds
+_STAY = (None, 6, 4)  # so many at most after each round
+_LABOUR = 4.0  # times the solver's iterations of the best one, for nothing
 
 
 def choose(
@@ -40,11 +42,12 @@ def choose(
 ) -> tuple[Trials, str]:
     """Tries MPCs on the models of the log and names the best.
 
-    In rounds, each with more starts: after each, those leave that cost clearly more than the best. Where the last one
-    leaves several that are not alike, all usual starts choose and the spare ones judge. The best has the least mean
-    cost on the median model, of those that have a vote. It is taken if it costs no more than ``"MPC_1"`` by both
-    regressions of the cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the next
-    best is asked; where no model has a vote, ``"MPC_1"`` stays.
+    In rounds, each with more starts: after each, those leave that cost clearly more than the best; from the second one
+    on those, too, that take their solver over four times its iterations, and what comes after the six best, then the
+    four best. Where the last one leaves several that are not alike, all usual starts choose and the spare ones judge.
+    The best has the least mean cost on the median model, of those that have a vote. It is taken if it costs no more
+    than ``"MPC_1"`` by both regressions of the cost, and the starts that are left do not say otherwise
+    (:meth:`Trials.improves`), else the next best is asked; where no model has a vote, ``"MPC_1"`` stays.
 
     What acts in a round does so in groups of four: here, or as jobs of the executor that ``$MPCOFFLINE_EXECUTOR``
     names, which gives the same numbers.
@@ -83,22 +86,26 @@ def _chosen(
     def act(names: list[str], starts: slice) -> None:
         stage.act(names, trials, starts)
 
+    def still_good(end: int, turn: int = 0) -> list[str]:
+        labour = {name: stage.iterations(name) for name in left} if turn else {}
+        return _still_good(trials, left, end, preferred, labour)[: _STAY[min(turn, len(_STAY) - 1)]]
+
     for turn, end in enumerate(ends):
         act(left, slice(begin, end))
         if turn < len(_VARIED):  # what is better may be better still
-            good = _still_good(trials, left, end, preferred)[: _VARIED[turn]]
+            good = still_good(end)[: _VARIED[turn]]
             more = variants({name: mpcs[name] for name in good}, turn)
             mpcs.update(more)
             stage.add(more)
             trials, left = trials.with_names(list(more)), [*left, *more]
             act(list(more), slice(0, end))
-        left, begin = [FIRST, *_still_good(trials, left, end, preferred)], end
+        left, begin = [FIRST, *still_good(end, turn)], end
         if left == [FIRST]:
             return trials.judged_from(begin), FIRST
     total = usual
     if len(left) > 2 and len(around.rows) > usual:
         act(left, slice(begin, usual))
-        left, begin, total = [FIRST, *_still_good(trials, left, usual, preferred)], usual, len(around.rows)
+        left, begin, total = [FIRST, *still_good(usual, len(ends))], usual, len(around.rows)
     act([FIRST], slice(begin, total))
     chosen = FIRST
     for name in left[1 : 1 + _JUDGED]:
@@ -144,6 +151,7 @@ class Stage:
         self._around, self._usual, self._tell = around, usual, tell
         self._mpcs: dict[str, MPC] = {}
         self._acting = _Acting(around)
+        self._spent: dict[str, tuple[int, int]] = {}  # iterations, starts
         self._pool: Executor[_Act, list[Episodes]] | None = None
         kind = chosen(default="serial")
         if kind is not Serial:
@@ -173,11 +181,22 @@ class Stage:
         if self._pool is None:
             for told, job in jobs.items():
                 self._tell(starts.start, self._usual, told)
-                trials.put(dict(zip(job.mpcs, self._acting(job), strict=True)), self._around, starts)
+                self._put(dict(zip(job.mpcs, self._acting(job), strict=True)), trials, starts)
             return
         self._tell(starts.start, self._usual, "; ".join(jobs))
         for told, done in self._pool.run(jobs):
-            trials.put(dict(zip(jobs[told].mpcs, done, strict=True)), self._around, starts)
+            self._put(dict(zip(jobs[told].mpcs, done, strict=True)), trials, starts)
+
+    def _put(self, done: dict[str, Episodes], trials: Trials, starts: slice) -> None:
+        trials.put(done, self._around, starts)
+        for name, episodes in done.items():
+            iterations, count = self._spent.get(name, (0, 0))
+            self._spent[name] = iterations + episodes.iterations, count + episodes.cost.shape[1]
+
+    def iterations(self, name: str) -> float:
+        """How many iterations of its solver an MPC has taken so far, a start."""
+        iterations, count = self._spent[name]
+        return iterations / count
 
 
 class _Act(NamedTuple):
@@ -227,10 +246,11 @@ def quick_policy(mpc: MPC) -> MPCPolicy:
     return MPCPolicy(mpc)
 
 
-def _still_good(trials: Trials, names: list[str], end: int, preferred: str) -> list[str]:
+def _still_good(trials: Trials, names: list[str], end: int, preferred: str, labour: Mapping[str, float]) -> list[str]:
     """Those, but MPC_1, that are not clearly worse than the best; the best first, or the preferred one if as good.
 
-    Of those that are alike, the first.
+    Of those that are alike, the first. Where labour is known, iterations a start, none that takes much more of it than
+    the best: whoever hands it out would wait for nothing.
     """
     differences = {name: trials.differences(name)[trials.votes][:, :end] for name in names}
     score = {name: float(np.median(each.mean(axis=1))) for name, each in differences.items()}
@@ -238,6 +258,8 @@ def _still_good(trials: Trials, names: list[str], end: int, preferred: str) -> l
     trifle = _TRIFLE * abs(score[best])
 
     def near(name: str) -> bool:
+        if labour and name != best and labour[name] > _LABOUR * max(labour[best], 1.0):
+            return False
         gap = differences[name] - differences[best]
         mean, error = gap.mean(axis=1), gap.std(axis=1) / np.sqrt(end)
         return bool(np.mean(mean > np.maximum(_CLEAR * error, trifle)) <= 0.5)

@@ -233,7 +233,7 @@ def _network(
     q = _fitted(RandomFeatures(x, 0, rng), x[seen], y[seen], folds[seen])
     rest = (y - q(x))[:, None]
     data, ends = ((x[rows], rest[rows]) for rows in (_some(np.setdiff1d(seen, stop), rng), _some(stop, rng)))
-    return Corrected(q, fit_small_network(data, ends, _HIDDEN, rng)), test
+    return Corrected(q, fit_small_network(data, ends, _HIDDEN, int(rng.integers(2**31)))), test
 
 
 def _ratio(found: list[tuple[Regressed, NDArray[np.intp]]], y: Array, x: Array, q: Fitted) -> float:

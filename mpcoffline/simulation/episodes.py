@@ -32,6 +32,7 @@ class Episodes:
         actions_kept: Inputs with every model, ``(models, kept, T, nu)``.
         least: What the cheapest step cost with each model, by either regression, ``(models,)``; an episode's end is a
             step, and one that has ended costs nothing.
+        iterations: Of its solver, in all steps and episodes together; 0 for what has none.
     """
 
     cost: Array
@@ -42,3 +43,10 @@ class Episodes:
     states_kept: Array
     actions_kept: Array
     least: Array
+    iterations: int
+
+
+def iterations_of(controller: Controller) -> int:
+    """Those of a controller's solver so far; 0 where it has none."""
+    stats = getattr(controller, "solver_stats", None)
+    return 0 if stats is None else int(stats.iterations)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from mpcoffline.datasets.table.memory import with_memory
@@ -33,7 +35,7 @@ def surroundings_of(
     table: TransitionTable,
     found: Identification,
     *,
-    slow: bool = False,
+    are_slow: Callable[[], bool] = lambda: False,
     choosing: bool = False,
     n_starts: int | None = None,
     n_steps: int | None = None,
@@ -47,7 +49,8 @@ def surroundings_of(
         nominal: MPC_1; its stage cost may be the logged one.
         table: The transitions as they were logged, or of the MPC's states.
         found: What was identified.
-        slow: Whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best models only.
+        are_slow: Says whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best
+            models only. It is asked when the models are there: solvers may be compiled meanwhile.
         choosing: Whether many controllers are tried: then on the four best models, whichever they are.
         n_starts: Number of episodes on each model; by default 64, and others for where these decide nothing. They begin
             where those of the log did; where it has fewer, in like states, too.
@@ -65,10 +68,11 @@ def surroundings_of(
         clean = found.table
     elif not found.noise.negligible:
         clean = smooth(identified, logged, found.theta, found.noise)
-    most_models = _FEW_MODELS if slow else _CHOOSING_MODELS if choosing else _MOST_MODELS
     seen = None if sees_memory(mpc.layout, mpc.stage_cost) else mpc.ny
     cost = LoggedCost(clean, seed, seen, mpc=nominal.with_delay(mpc.layout.delay), logged=logged)
     models = LogModels.of(identified, clean, found, seed=seed, believed=cost.as_applied)
+    slow = are_slow()
+    most_models = _FEW_MODELS if slow else _CHOOSING_MODELS if choosing else _MOST_MODELS
     models = models.asked(most_models, identified=not choosing)
     most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
     spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE

@@ -21,7 +21,7 @@ from mpcoffline.mpc.layout import Layout
 from mpcoffline.mpc.outputs import shown
 from mpcoffline.solvers import Plan
 
-from .episodes import Controller, Episodes
+from .episodes import Controller, Episodes, iterations_of
 from .logged_cost import LoggedCost
 from .models import LogModels
 from .starts import cheapest_step, returns_along, signals_along
@@ -298,6 +298,7 @@ class Surroundings:
         states_kept, actions_kept = [x[:, :, :kept].copy()], []
         acted = np.full((*shape, len(self._layout.acting)), np.nan)  # nothing, yet
         courses = [self._course(controller, x[:, i], starts) for i, controller in enumerate(controllers)]
+        before = [iterations_of(controller) for controller in controllers]
         for k in range(self.n_steps):
             seen, u = x[..., :ny].copy(), np.empty((*shape, self._layout.nu))
             seen[..., :n] += noise[k]
@@ -338,9 +339,9 @@ class Surroundings:
         return [
             Episodes(
                 *(total[:, i], second[:, i], lost[:, i], seen[i], done[i]),
-                *(kept_states[:, i], kept_actions[:, i], least[:, i]),
+                *(kept_states[:, i], kept_actions[:, i], least[:, i], iterations_of(controller) - before[i]),
             )
-            for i in range(c)
+            for i, controller in enumerate(controllers)
         ]
 
     def _outputs(self, x: Array, acted: Array, starts: slice, k: int) -> Array:
