@@ -54,6 +54,7 @@ from .measures import (
 from .notes import Fit, notes_on
 from .report import PredictionCheck, Report, Trust
 from .stability import TheoremCheck, closed_loop_eigenvalues, leaves_reference, value_growth, weight_checks
+from .travel import travels
 from .verdict import decide
 
 if TYPE_CHECKING:
@@ -185,6 +186,7 @@ def diagnose(
         ),
         trust=trust,
         limits=limits,
+        travel=travels(nominal, logged, first, second),
         background=Background(
             names=names_of(dataset, learned),
             dt=learned.model.dt,

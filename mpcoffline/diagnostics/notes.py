@@ -72,6 +72,19 @@ def _at_limits(report: Report, _: Fit) -> Iterator[str]:
         )
 
 
+def _travel(report: Report, _: Fit) -> Iterator[str]:
+    busy = [each for each in report.travel if each.much]
+    if busy:
+        moved = listed(
+            [f"{e.name} by {e.shares[2]:.1%} of its range a step ({e.shares[0]:.1%} in the log)" for e in busy]
+        )
+        yield (
+            f"The learned MPC moves {moved}: nothing in its cost speaks against that. Where it wears an actuator, give"
+            " changes of inputs a price (changes={name: weight} in a plant file, D= of QuadraticCost), or a limit"
+            " (rate= of an input), and fit again."
+        )
+
+
 def _value(report: Report, fit: Fit) -> Iterator[str]:
     if fit.value and report.value.blind:
         yield (
@@ -131,6 +144,7 @@ RULES: tuple[Rule, ...] = (
     _noise,
     _failures,
     _at_limits,
+    _travel,
     _value,
     _model,
     _undetermined,
@@ -139,4 +153,4 @@ RULES: tuple[Rule, ...] = (
     _stability,
     _weights,
 )
-_OF_LEARNED = (_at_limits, _model, _growth, _stability, _weights)
+_OF_LEARNED = (_at_limits, _travel, _model, _growth, _stability, _weights)

@@ -290,6 +290,10 @@ def _numbers(values: Iterable[float]) -> str:
     return ", ".join(number(each, 3) for each in values)
 
 
+def _shares(shares: Iterable[float]) -> str:
+    return "; ".join(share(each) if np.isfinite(each) else "–" for each in shares)
+
+
 def _checks(report: Report) -> dict[str, list[tuple[str, str]]]:
     """The report's other figures, by what they are about."""
     p, v, t = report.prediction, report.value, report.theorem
@@ -325,6 +329,7 @@ def _checks(report: Report) -> dict[str, list[tuple[str, str]]]:
             ("Problems of MPC_1 not solved at first", share(report.failed_solves[0])),
             ("of the proposal", share(report.failed_solves[1])),
             ("Parameters at a bound", listed(report.at_bounds, 12) or "none"),
+            *((f"{e.name} moves a step, of its range: log; MPC_1; proposal", _shares(e.shares)) for e in report.travel),
         ],
         "data": [("Logged states near the goal", reached)],
     }

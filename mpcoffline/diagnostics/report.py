@@ -28,6 +28,7 @@ from .limits import LimitCheck
 from .measures import GoalCheck, LagCheck, RegionError, ValueCheck
 from .page import Section, page_of
 from .stability import TheoremCheck, WeightCheck
+from .travel import Travel
 from .verdict import Judgement, Verdict, costs_of
 
 if TYPE_CHECKING:
@@ -102,6 +103,7 @@ class Report:
         traces: What the figure shows besides; not in the JSON form.
         trust: How well the models reproduce what the log itself cost; None where none has a vote.
         limits: How often each limit of the MPC that was given is violated.
+        travel: How far each input travels.
         background: What :meth:`html` shows besides; not in the JSON form.
     """
 
@@ -127,6 +129,7 @@ class Report:
     traces: Traces = field(repr=False, compare=False)
     trust: Trust | None = None
     limits: tuple[LimitCheck, ...] = ()
+    travel: tuple[Travel, ...] = ()
     background: Background | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -165,6 +168,7 @@ class Report:
             ("closed-loop eigenvalues", _numbers(self.theorem.eigenvalues) or "unknown"),
             *((f"eigenvalues of {w.name}", f"{_numbers(w.before)} before, {_numbers(w.after)} after")
               for w in self.weights),
+            *((f"{each.name} moves a step", _travel_text(each)) for each in self.travel),
             ("parameters at bounds", listed(self.at_bounds, 3) or "none"),
             ("measurement noise", f"{self.noise.level:.1%} of the states' spread ({self.noise.source})"),
             ("effect of past inputs", f"{self.lag.share:.1%} of the present one's"),
@@ -321,6 +325,11 @@ def _columns(rows: list[tuple[str, ...]]) -> list[str]:
 def _item(text: str) -> str:
     """A list item, wrapped."""
     return textwrap.fill(text, _WIDTH, initial_indent="  - ", subsequent_indent="    ", break_on_hyphens=False)
+
+
+def _travel_text(travel: Travel) -> str:
+    logged, first, proposed = (f"{share:.1%}" if share == share else "?" for share in travel.shares)
+    return f"{logged} of its range in the log, {first} MPC_1, {proposed} learned"
 
 
 def _numbers(values: tuple[float, ...]) -> str:

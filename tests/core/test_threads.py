@@ -1,11 +1,25 @@
-"""BLAS has one thread inside, and what it had before outside."""
+"""BLAS has one thread inside, and what it had before outside; jobs side by side give what they give in turns."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from functools import partial
+
 import numpy as np
+import pytest
+import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mpcoffline.core.threads import one_blas_thread
+from mpcoffline.core.threads import one_blas_thread, side_by_side
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 def blas_threads() -> set[int]:
@@ -26,3 +40,24 @@ def test_one_inside_and_as_before_outside() -> None:
 
         assert inside() <= {1}
         assert blas_threads() == before
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_two_jobs_are_at_work_at_once_and_answer_in_their_order() -> None:
+    both = threading.Barrier(2, timeout=30.0)  # which one job alone would wait for in vain
+
+    def job(number: int) -> int:
+        both.wait()
+        return number
+
+    assert side_by_side([partial(job, number) for number in range(4)]) == [0, 1, 2, 3]
+    assert side_by_side([]) == []
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_what_a_job_raises_is_raised() -> None:
+    def broken() -> int:
+        raise ValueError("of the job")
+
+    with pytest.raises(ValueError, match="of the job"):
+        side_by_side([lambda: 1, broken])

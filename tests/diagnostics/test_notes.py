@@ -26,6 +26,7 @@ from mpcoffline.diagnostics.stability import (
     leaves_reference,
     weight_checks,
 )
+from mpcoffline.diagnostics.travel import Travel
 from mpcoffline.estimation.smoothing import NoiseEstimate
 from mpcoffline.solvers import make_solver
 
@@ -45,6 +46,7 @@ def notes(fit: Fit = FIT, **changes: Any) -> tuple[str, ...]:
         "prediction": PredictionCheck(0.5, 0.1, 0.1, ()),
         "at_bounds": (),
         "limits": (LimitCheck("level", "hard", (0.0, 0.0, 0.04), (0.0, 0.0, 0.1), False),),
+        "travel": (Travel("valve", (0.01, 0.05, 0.028), held=False),),
         "theorem": TheoremCheck(1.0, 0.0, (0.9, 0.2)),
         "weights": (WeightCheck("W", (0.1, 1.0), (0.1, 1.0)),),
     }
@@ -53,6 +55,21 @@ def notes(fit: Fit = FIT, **changes: Any) -> tuple[str, ...]:
 
 def test_nothing_is_said_of_a_report_without_a_fault() -> None:
     assert notes() == ()
+
+
+def test_inputs_that_travel_much_farther_than_before_are_named() -> None:
+    """Not where that is little of their range, where it is priced, or where the log has no two steps in a row."""
+    (said,) = notes(
+        travel=(Travel("valve", (0.01, 0.05, 0.031), held=False), Travel("pump", (0.1, 0.1, 0.1), held=False))
+    )
+    assert "valve by 3.1% of its range a step (1.0% in the log)" in said
+    assert "pump" not in said
+    assert "changes={name: weight}" in said
+    little, priced, unknown = (0.001, 0.004, 0.0049), (0.01, 0.05, 0.1), (float("nan"), 0.05, 0.1)
+    assert notes(travel=(Travel("valve", little, held=False),)) == ()
+    assert notes(travel=(Travel("valve", priced, held=True),)) == ()
+    assert notes(travel=(Travel("valve", unknown, held=False),)) == ()
+    assert notes(Fit(True, True, True, learned=False), travel=(Travel("valve", priced, held=False),)) == ()
 
 
 def test_a_plan_that_lives_beyond_its_limits_is_offered_a_margin() -> None:

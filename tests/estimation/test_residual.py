@@ -160,3 +160,19 @@ def test_the_gate_is_open_in_the_data_and_shut_outside_whatever_the_units() -> N
     assert Gate.of(data).standardised(outside)[1].max() < 0.01
     units = np.array([1e3, 1e-3, 1.0])
     np.testing.assert_allclose(Gate.of(units * data).standardised(units * data)[1], gate, rtol=1e-6)
+
+
+def test_threads_change_no_digit_of_an_ensemble(learned: tuple[MPC, Residual, TransitionTable]) -> None:
+    mpc, _, table = learned
+    before, found = torch.get_num_threads(), []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            found.append(fit_residuals(mpc, table, 3, count=3))
+        finally:
+            torch.set_num_threads(before)
+    for one, two in zip(*found, strict=True):
+        assert one.network is not None
+        assert two.network is not None
+        for A, B in zip(one.network.weights, two.network.weights, strict=True):
+            np.testing.assert_array_equal(A, B)

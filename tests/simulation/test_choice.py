@@ -12,10 +12,11 @@ from mpcoffline.core.parallel import SETTING
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC, QuadraticCost
 from mpcoffline.plants import nominal_mpc
+from mpcoffline.simulation import choice
 from mpcoffline.simulation.choice import FIRST, choose, quick_policy
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
-from mpcoffline.simulation.trials import Surroundings
+from mpcoffline.simulation.trials import Surroundings, Trials
 
 LOG = episodes()
 BEST = lq_plant.make_mpc((lq_plant.A, lq_plant.B)).replace(discount=1.0, horizon=20)
@@ -60,3 +61,45 @@ def test_simulated_solves_end_near_the_minimum() -> None:
     span = float(mpc.action_high[0] - mpc.action_low[0])
     np.testing.assert_allclose(near.u0, exact.u0, atol=1e-3 * span)
     assert near.stats["iterations"].sum() <= exact.stats["iterations"].sum()
+
+
+def made_up(around: Surroundings, gaps: dict[str, float], noise: float) -> Trials:
+    """Trials in which each MPC costs 100 and a gap, with noise of its own at each start."""
+    trials, rng = Trials.none([FIRST, *gaps], around), np.random.default_rng(0)
+    level = 100.0 + 20.0 * rng.standard_normal(trials.cost.shape[1:])
+    for k, gap in enumerate([0.0, *gaps.values()]):
+        trials.cost[k] = trials.second[k] = level + gap + noise * rng.standard_normal(level.shape)
+    return trials
+
+
+def test_what_takes_much_more_of_its_solver_than_the_best_leaves(around: Surroundings) -> None:
+    """Where it is not better: no difference can be seen between the first two; the third is the best for sure."""
+    gaps = {"quick": -10.2, "creeping": -10.0}
+    labour = {"quick": 100.0, "creeping": 500.0, "dear": 5_000.0, FIRST: 80.0}
+
+    def left(gaps: dict[str, float], labour: dict[str, float]) -> list[str]:
+        return choice._still_good(made_up(around, gaps, 0.3), list({FIRST: 0.0, **gaps}), 16, "", labour)
+
+    assert left(gaps, {}) == ["quick", "creeping"]
+    assert left(gaps, labour) == ["quick"]
+    assert left(gaps, {**labour, "creeping": 350.0}) == ["quick", "creeping"]
+    assert left({**gaps, "dear": -20.0}, labour) == ["dear"]
+
+
+def test_ever_fewer_go_on(around: Surroundings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All act in the first rounds, then MPC_1 and six, then MPC_1 and four, whatever their costs say."""
+    factors = dict(zip([FIRST, *"abcdefgh"], np.geomspace(30.0, 0.2, 9), strict=True))
+    many = {
+        name: BEST.replace(stage_cost=QuadraticCost(lq_plant.W, f * np.asarray(lq_plant.R)))
+        for name, f in factors.items()
+    }
+    monkeypatch.setattr(choice, "_still_good", lambda trials, names, *how: [name for name in names if name != FIRST])
+    monkeypatch.delenv(SETTING, raising=False)
+    acted: dict[int, set[str]] = {}
+
+    def tell(start: int, _: int, names: str) -> None:
+        acted.setdefault(start, set()).update(names.split(", ") if names else ())
+
+    rows = LOG.episodes.firsts[:16]
+    choose(many, Surroundings(around.models, LoggedCost(LOG), LOG, rows, 20, BEST.layout, spare=4), tell=tell)
+    assert [len(acted[start]) for start in sorted(acted)][:4] == [9, 9, 7, 5]
