@@ -10,12 +10,11 @@ from functools import lru_cache, partial
 
 import casadi as ca
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
-from mpcoffline.mpc.torch_twin import TorchTwin
+from mpcoffline.mpc.row_twin import RowTwin
 
 
 class OneStep:
@@ -47,9 +46,7 @@ class OneStep:
         return predicted, slopes, states
 
     def _evaluated(self, n_parts: int, x: Array, u: Array, theta: Array) -> list[Array]:
-        columns = [torch.from_numpy(np.ascontiguousarray(v.T)).T for v in (x, u)]  # each entry in one piece of memory
-        with torch.no_grad():
-            flat = self._twin(n_parts)(*columns, torch.from_numpy(theta)).numpy()
+        flat = self._twin(n_parts)(x, u, theta)
         shapes = self._shapes[:n_parts]
         ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
         parts = np.split(flat, ends[:-1], axis=1)
@@ -57,7 +54,7 @@ class OneStep:
 
 
 @lru_cache(maxsize=32)
-def _twin(plant: ca.Function, size: int, index: tuple[int, ...], n_parts: int) -> TorchTwin:
+def _twin(plant: ca.Function, size: int, index: tuple[int, ...], n_parts: int) -> RowTwin:
     """The first of prediction, df/dtheta and df/dx in one column; the model's parameters come first in theta."""
     x, u, theta = ca.SX.sym("x", plant.numel_in(0)), ca.SX.sym("u", plant.numel_in(1)), ca.SX.sym("theta", size)
     reached = plant(x, u, theta[: plant.numel_in(2)])
@@ -67,4 +64,4 @@ def _twin(plant: ca.Function, size: int, index: tuple[int, ...], n_parts: int) -
     if n_parts > 2:
         parts.append(ca.jacobian(reached, x).T)
     column = ca.vertcat(*(ca.vec(ca.densify(part)) for part in parts))
-    return TorchTwin(ca.Function("one_step", [x, u, theta], [column]))
+    return RowTwin(ca.Function("one_step", [x, u, theta], [column]))

@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from mpcoffline.core.types import Array
@@ -169,9 +170,12 @@ def _descended(
         curvature, slope, error = _normal_equations(_layers(p, shapes), *batch, len(p))
         slope -= decay * p
         for _ in range(_ATTEMPTS):
-            diagonal = damping * (np.diag(curvature) + decay) + decay
-            trial = p + np.linalg.solve(curvature + np.diag(diagonal), slope)
-            if _error(_layers(trial, shapes), *batch) + decay * trial @ trial < error + decay * p @ p:
+            step = _solved(curvature, damping * (np.diag(curvature) + decay) + decay, slope)
+            trial = p if step is None else p + step
+            if (
+                step is not None
+                and _error(_layers(trial, shapes), *batch) + decay * trial @ trial < error + decay * p @ p
+            ):
                 p, damping = trial, max(damping / 3.0, least)
                 break
             damping = min(4.0 * damping, most)
@@ -180,6 +184,17 @@ def _descended(
         if since >= _PATIENCE:
             break
     return _layers(best, shapes), least_error
+
+
+def _solved(curvature: Array, diagonal: Array, slope: Array) -> Array | None:
+    """The step ``(curvature + diag(diagonal))^-1 slope``; None where rounding has left the sum without a root."""
+    matrix = curvature.copy()
+    np.fill_diagonal(matrix, np.diag(curvature) + diagonal)
+    try:
+        factor = scipy.linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(scipy.linalg.cho_solve(factor, slope, check_finite=False))
 
 
 def _layers(flat: Array, shapes: list[tuple[int, ...]]) -> Layers:

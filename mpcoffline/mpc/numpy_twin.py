@@ -80,11 +80,14 @@ class NumpyTwin:
 
     Raises:
         InvalidArgumentError: If it cannot be expanded to SX, or uses an operation that numpy has not.
+
+    Attributes:
+        n_out: Size m of its output.
     """
 
     def __init__(self, function: ca.Function) -> None:
         flat = expanded(function)
-        self._n_out, self._n_work = flat.numel_out(0), flat.sz_w()
+        self.n_out, self._n_work = flat.numel_out(0), flat.sz_w()
         self._values: list[Any] = []  # of each instruction, where it is a number
         self._reads: list[tuple[int, int, int]] = []  # instruction, input, element
         self._calls: list[tuple[int, Callable[..., Any], int, int | None, int]] = []  # operands, where to write
@@ -109,8 +112,8 @@ class NumpyTwin:
                 latest[targets[0]] = k
 
     def __call__(self, *columns: Array) -> Array:
-        """Its first output at B points, ``(m, B)``, of as many columns of each input, ``(n_i, B)``."""
-        room = np.empty((self._n_work + self._n_out, columns[0].shape[1]))
+        """Its first output at B points, ``(m, B)``, of as many columns of each input, ``(n_i, B)``, or one for all."""
+        room = np.empty((self._n_work + self.n_out, max(column.shape[1] for column in columns)))
         rows, values = list(room), self._values.copy()
         for k, i, element in self._reads:
             values[k] = columns[i][element]

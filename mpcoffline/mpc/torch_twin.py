@@ -82,7 +82,7 @@ _BINARY: dict[int, Callable[[Tensor, Tensor], Tensor]] = _ARITHMETIC | {
 }
 
 
-_LARGE = 2000  # instructions, from which on layers are looked for
+LARGE = 2000  # instructions, from which on layers are looked for
 
 
 class TorchTwin:
@@ -122,8 +122,13 @@ class TorchTwin:
         self._reads = [(k, *places) for k, (op, places, _) in enumerate(self._program) if op == ca.OP_INPUT]
         self._branches = any(op == ca.OP_IF_ELSE_ZERO for op, *_ in self._program)
         self._layers: Layered | None = None
-        if len(self._program) > _LARGE and not self._branches:
+        if len(self._program) > LARGE and not self._branches:
             self._layers = layered(function)
+
+    @property
+    def in_layers(self) -> bool:
+        """Whether it is evaluated by products of matrices."""
+        return self._layers is not None
 
     def _folded(self, op: int, places: list[int], constant: float) -> tuple[int, list[int], float]:
         """The instruction; the number that it gives where all operands are numbers."""

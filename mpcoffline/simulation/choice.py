@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Self
 
@@ -29,7 +30,7 @@ _RETRIED = 0.1  # of the solves
 _JUDGED = 3  # of the best at most, one after the other
 _NEAR, _ITERATIONS = 1e-8, 60  # tolerance and iterations of simulated solves; a plant's own are nearer to the minimum
 _VARIED = (3, 1)  # of so many of the best, variants are tried after each of the first rounds
-_STAY = (None, 6, 4)  # so many at most after each round
+_STAY = (math.inf, 6, 4)  # so many at most after each round, and the preferred one
 _LABOUR = 4.0  # times the solver's iterations of the best one, for nothing
 
 
@@ -45,9 +46,10 @@ def choose(
     In rounds, each with more starts: after each, those leave that cost clearly more than the best; from the second one
     on those, too, that take their solver over four times its iterations, and what comes after the six best, then the
     four best. Where the last one leaves several that are not alike, all usual starts choose and the spare ones judge.
-    The best has the least mean cost on the median model, of those that have a vote. It is taken if it costs no more
-    than ``"MPC_1"`` by both regressions of the cost, and the starts that are left do not say otherwise
-    (:meth:`Trials.improves`), else the next best is asked; where no model has a vote, ``"MPC_1"`` stays.
+    The best has the least mean cost on the median model, of those that have a vote; but first comes the preferred one,
+    where nothing has shown it to be worse. It is taken if it costs no more than ``"MPC_1"`` by both regressions of the
+    cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the next best is asked;
+    where no model has a vote, ``"MPC_1"`` stays.
 
     What acts in a round does so in groups of four: here, or as jobs of the executor that ``$MPCOFFLINE_EXECUTOR``
     names, which gives the same numbers.
@@ -57,7 +59,7 @@ def choose(
         around: Where they are tried; at most two thirds of its starts are used to choose.
         variants: What is tried, too, of the three best after the first round (turn 0), of the best after the next (1).
         tell: Is told how many starts of how many are done, and what is tried.
-        preferred: Which one is taken where it is as good as the best, but for a hundredth of the gain.
+        preferred: Which one is taken where no other is clearly better, and always goes on until then.
 
     Returns:
         The trials, and the name of the best.
@@ -88,7 +90,8 @@ def _chosen(
 
     def still_good(end: int, turn: int = 0) -> list[str]:
         labour = {name: stage.iterations(name) for name in left} if turn else {}
-        return _still_good(trials, left, end, preferred, labour)[: _STAY[min(turn, len(_STAY) - 1)]]
+        good, most = _still_good(trials, left, end, preferred, labour), _STAY[min(turn, len(_STAY) - 1)]
+        return [name for place, name in enumerate(good) if place < most or name == preferred]
 
     for turn, end in enumerate(ends):
         act(left, slice(begin, end))
@@ -108,7 +111,7 @@ def _chosen(
         left, begin, total = [FIRST, *still_good(usual, len(ends))], usual, len(around.rows)
     act([FIRST], slice(begin, total))
     chosen = FIRST
-    for name in left[1 : 1 + _JUDGED]:
+    for name in sorted(left[1:], key=lambda name: name != preferred)[:_JUDGED]:
         act([name], slice(begin, total))
         if trials.judged_from(begin).improves(name):
             chosen = name

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidDataError
@@ -16,8 +15,8 @@ from mpcoffline.estimation.identification import OneStepProblem
 from mpcoffline.estimation.rows import Rows
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.integrators import Scheme
+from mpcoffline.mpc.row_twin import RowTwin
 from mpcoffline.mpc.substeps import Flow, choice_on
-from mpcoffline.mpc.torch_twin import TorchTwin
 
 _ROWS = 3_000  # on which the parameters are identified
 _LEAST_MOVE = 0.02  # of the increments' spread
@@ -49,7 +48,7 @@ class Members:
         kept: Sequence[Callable[[Array], Array]] = (),
     ) -> None:
         self._mpc, self._residuals, self._kept = mpc, residuals, kept
-        self._twin, self.thetas = TorchTwin(mpc.plant_function), thetas
+        self._twin, self.thetas = RowTwin(mpc.plant_function), thetas
         self._networks = _Networks(residuals) if residuals else None
 
     def some(self, kept: NDArray[np.bool_]) -> Members:
@@ -64,9 +63,7 @@ class Members:
 
     def __call__(self, x: Array, u: Array) -> Array:
         """The successors of plant states ``(m, n, n_states)`` under what acts ``(m, n, nu)``, each member its own."""
-        columns = [torch.from_numpy(np.array(v.transpose(2, 0, 1), order="C")).permute(1, 2, 0) for v in (x, u)]
-        with torch.no_grad():
-            reached = self._twin(*columns, torch.from_numpy(self.thetas[:, None])).numpy()
+        reached = self._twin(x, u, self.thetas[:, None])
         if self._networks is not None:
             first = len(self) - len(self._networks)
             reached[first:, :, self._networks.outputs] += self._networks(np.concatenate([x, u], axis=2)[first:])

@@ -86,8 +86,14 @@ def test_what_takes_much_more_of_its_solver_than_the_best_leaves(around: Surroun
     assert left({**gaps, "dear": -20.0}, labour) == ["dear"]
 
 
-def test_ever_fewer_go_on(around: Surroundings, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All act in the first rounds, then MPC_1 and six, then MPC_1 and four, whatever their costs say."""
+@pytest.mark.parametrize("preferred", ["", "h"])
+def test_ever_fewer_go_on_and_the_preferred_one(
+    around: Surroundings, monkeypatch: pytest.MonkeyPatch, preferred: str
+) -> None:
+    """All act in the first rounds, then MPC_1 and six, then MPC_1 and four, whatever their costs say.
+
+    The preferred one acts in all, and is taken where nothing says that another is better.
+    """
     factors = dict(zip([FIRST, *"abcdefgh"], np.geomspace(30.0, 0.2, 9), strict=True))
     many = {
         name: BEST.replace(stage_cost=QuadraticCost(lq_plant.W, f * np.asarray(lq_plant.R)))
@@ -101,5 +107,8 @@ def test_ever_fewer_go_on(around: Surroundings, monkeypatch: pytest.MonkeyPatch)
         acted.setdefault(start, set()).update(names.split(", ") if names else ())
 
     rows = LOG.episodes.firsts[:16]
-    choose(many, Surroundings(around.models, LoggedCost(LOG), LOG, rows, 20, BEST.layout, spare=4), tell=tell)
-    assert [len(acted[start]) for start in sorted(acted)][:4] == [9, 9, 7, 5]
+    stage = Surroundings(around.models, LoggedCost(LOG), LOG, rows, 20, BEST.layout, spare=4)
+    _, chosen = choose(many, stage, tell=tell, preferred=preferred)
+    more = bool(preferred)
+    assert [len(acted[start]) for start in sorted(acted)][:4] == [9, 9, 7 + more, 5 + more]
+    assert chosen == (preferred or "a")
