@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpcoffline.core.checks import check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.places import warn_once
 from mpcoffline.core.types import Array
@@ -92,8 +93,7 @@ class Model(Component):
         labels: Labels | None = None,
     ) -> None:
         layout = replace(Layout.of(nx, nu, delay, signals), labels=labels or Labels())
-        if not (np.isfinite(dt) and dt > 0.0):
-            raise InvalidArgumentError("dt", expected="a positive number of seconds", actual=str(dt))
+        check_number("dt, in s", dt, 0.0)
         if discrete and integrator != "auto":
             raise InvalidArgumentError("integrator", expected="none for a discrete map", actual=repr(integrator))
         self.dt: float = float(dt)

@@ -95,9 +95,10 @@ def test_model_without_parameters() -> None:
         ({"nx": 0}, "nx: expected a positive integer"),
         ({"nu": -1}, "nu: expected a positive integer"),
         ({"nx": 2.7}, "nx: expected a positive integer, got 2.7"),
-        ({"dt": 0.0}, "dt: expected a positive number of seconds"),
-        ({"dt": -0.1}, "dt: expected a positive number"),
-        ({"dt": np.nan}, "dt: expected a positive number"),
+        ({"dt": 0.0}, "dt, in s: expected a finite number above 0"),
+        ({"dt": -0.1}, "dt, in s: expected a finite number above 0"),
+        ({"dt": np.nan}, "dt, in s: expected a finite number above 0"),
+        ({"dt": None}, "dt, in s: expected a finite number above 0, got None"),
     ],
 )
 def test_bad_sizes(changes: dict[str, Any], message: str) -> None:
