@@ -31,7 +31,7 @@ def test_do_mpc_decides_what_ours_decides(case: str, tmp_path: Path, monkeypatch
     controller: Any = script.controller()
     width = np.asarray(mpc.action_high) - np.asarray(mpc.action_low)
     states = mpc.state(observations)
-    solved = DDPSolver(mpc, tolerance=1e-12).solve(states)
+    solved = DDPSolver(mpc, tolerance=1e-16).solve(states)  # at 1e-12 inputs are up to 1.4e-6 from where both end
     off = []
     for z, x, u, good in zip(states, solved.x, solved.u, solved.success, strict=True):
         if not good:
@@ -42,9 +42,8 @@ def test_do_mpc_decides_what_ours_decides(case: str, tmp_path: Path, monkeypatch
                 controller.opt_x_num["_u", k, 0] = np.append(u[k], np.zeros(script.N_SLACKS))
         found = controller.make_step(z.reshape(-1, 1))[: mpc.nu].ravel()
         off.append(np.max(np.abs(found - u[0]) / width))
-    assert len(off) >= 0.8 * N_OBSERVATIONS
-    assert np.quantile(off, 0.95) < 1e-6
-    assert max(off) < 1e-4
+    assert len(off) >= 0.99 * N_OBSERVATIONS
+    assert max(off) < 1e-6
 
 
 def test_its_functions_are_those_of_the_problem(tmp_path: Path) -> None:
