@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import torch
 
 from mpcoffline.control.evaluation import Predictor
 from mpcoffline.control.policy import MPCPolicy
@@ -17,6 +18,7 @@ from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation.identifying import identify
 from mpcoffline.learner.effort import core_seconds
 from mpcoffline.learner.learner import OfflineMPCLearner
+from mpcoffline.learning.bellman.equation import BellmanProblem
 from mpcoffline.mpc import MPC
 from mpcoffline.studies.plant_files import Loops
 from mpcoffline.studies.zoo import Found, noted, short_text
@@ -27,6 +29,8 @@ from .peers import PeerError, Peers, settings_to_try, time_mpcrl, train
 
 _TIMED = 100  # actions that are timed
 _TRANSITIONS = 20  # that mpcrl is timed on
+_ROWS = 4_096  # of a part of a pass over the log
+_OWN = ("train_s", "regressions_s", "verdict_s", "pass_s", "file_kb", "verdict")  # of :class:`Made`
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,9 @@ class Made:
     file_kb: float = NAN
     verdict: str = ""
     said: str = ""
+    regressions_s: float = NAN
+    verdict_s: float = NAN
+    pass_s: float = NAN
 
 
 def run_job(job: Job, peers: Peers | None = None) -> Outcome:
@@ -78,7 +85,7 @@ def _fill(found: Found, job: Job, peers: Peers | None) -> None:
     if made is None:
         found["said"] = "none is known"
         return
-    found.update(train_s=made.train_s, file_kb=made.file_kb, verdict=made.verdict, said=short_text(made.said))
+    found.update({name: getattr(made, name) for name in _OWN}, said=short_text(made.said))
     found["latency_ms"] = latency_ms(made.policy, table)
     _put(found, arena.loops(made.policy, job.seed, job.starts))
 
@@ -147,15 +154,33 @@ def _identified(arena: Arena, job: Job, table: TransitionTable, peers: Peers | N
 def _ours(arena: Arena, job: Job, table: TransitionTable, peers: Peers | None) -> Made:
     """A preset as it is, no option set for any plant; ``default`` with its verdict."""
     learner = OfflineMPCLearner(arena.rough(job.seed), arena.learn, preset=job.algorithm, seed=job.seed)
+    learned_by: list[float] = []  # until here nothing was chosen
     start = core_seconds()
-    learner.fit(table, show_progress=False)
-    seconds, verdict = core_seconds() - start, ""
+    learner.fit(table, show_progress=False, callbacks=[lambda *_: learned_by.append(core_seconds())])
+    times = {"train_s": core_seconds() - start, "regressions_s": max(learned_by) - start}
+    times["pass_s"] = _pass(learner, table)
+    verdict = ""
     if job.algorithm == "default":
         from mpcoffline.diagnostics import diagnose
 
+        start = core_seconds()
         verdict = diagnose(learner, table, seed=job.seed).verdict
+        times["verdict_s"] = core_seconds() - start
     handed_out = "" if learner.candidates is None else learner.candidates.chosen
-    return Made(learner.policy, seconds, _saved(learner.policy), verdict, handed_out)
+    return Made(learner.policy, file_kb=_saved(learner.policy), verdict=verdict, said=handed_out, **times)
+
+
+def _pass(learner: OfflineMPCLearner, table: TransitionTable) -> float:
+    """Time of (FIT)'s error of each transition with the V that was learned, and its gradient in theta."""
+    value, mpc = learner.value_function, learner.nominal_mpc
+    if value is None or mpc.nx != table.ny:
+        return NAN
+    problem, theta = BellmanProblem(mpc, value, 1.0), torch.from_numpy(mpc.theta).requires_grad_()
+    start = core_seconds()
+    for k in range(0, len(table), _ROWS):
+        rows = torch.from_numpy(np.array(table.rows[k : k + _ROWS]))
+        torch.autograd.grad(problem.error(table.columns(rows), theta), theta)
+    return core_seconds() - start
 
 
 def _peer(arena: Arena, job: Job, table: TransitionTable, peers: Peers | None) -> Made:

@@ -100,7 +100,10 @@ class Outcome:
         discounted: Jd, with the plant's own discount.
         success: Share of the episodes that end well, where the plant knows.
         violated: Share of the steps that violate a limit, where there are limits.
-        train_s: Time of the training in s of one core.
+        train_s: Time of the training in s of one core; of ours with its choice.
+        regressions_s: Of it, what ours learns in, without the choice.
+        verdict_s: What ``diagnose`` takes besides.
+        pass_s: What ours takes for one pass over the log: (FIT)'s error of each transition, and its gradient in theta.
         latency_ms: Median time of an action, one observation at a time.
         file_kb: Size of the saved controller.
         verdict: What ``diagnose`` says of ours.
@@ -122,6 +125,9 @@ class Outcome:
     success: float = NAN
     violated: float = NAN
     train_s: float = NAN
+    regressions_s: float = NAN
+    verdict_s: float = NAN
+    pass_s: float = NAN
     latency_ms: float = NAN
     file_kb: float = NAN
     verdict: str = ""

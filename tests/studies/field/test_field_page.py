@@ -21,7 +21,11 @@ def row(algorithm: str, size: int, cost: float, seed: int = 0, arena: str = "tan
 def results(tmp_path: Path) -> list[Outcome]:
     """A plant where ours loses from the small log and wins from the large one; another whose costs are negative."""
     rows = [row("truth", 0, 10.0), row("behaviour", 0, 40.0), row("truth", 0, 10.0, seed=1)]
-    rows += [row("default", 1_000, 15.0, verdict="recommend"), row("default", 1_000, 17.0, 1, verdict="keep MPC_1")]
+    times = {"train_s": 6.0, "regressions_s": 2.0, "verdict_s": 2.0, "pass_s": 0.01}
+    rows += [
+        row("default", 1_000, 15.0, verdict="recommend", **times),
+        row("default", 1_000, 17.0, 1, verdict="keep MPC_1"),
+    ]
     rows += [row("bc", 1_000, 12.0), row("default", 5_000, 10.1, verdict="recommend"), row("bc", 5_000, 10.0)]
     rows += [row("mpcrl", 1_000, np.nan, rows=1_000, train_s=24.0, said="from 2.00% of the log")]
     rows += [row("iql", 5_000, np.nan, error="no luck")]
@@ -53,7 +57,8 @@ def test_the_page_says_what_is_there_and_leaves_the_rest_blank(results: list[Out
     assert "* Not run on any log:" in text
     assert "IQL" in text.partition("* Not run on any log:")[2].splitlines()[0]
     assert "* Failed: tank, 5,000, seed 0, iql: no luck" in text
-    assert "| tank | 1,000 | 0 | 24 | 2.00% of the log | 24 |" in text.replace("\\", "")
+    timed = "| tank | 1,000 | 0 | 24 | 2.00% of the log | 24 | 0.01 (2,400 x) | 2 (12 x) | 8 (3 x) |"
+    assert timed in text.replace("\\", "")
     lost = text.partition("## What we lose")[2].partition("\n## ")[0]
     # Of the seeds that both have: 15 against 12; 10.1 is as good as 10.
     assert "* tank, 1,000 transitions: behaviour cloning (12 against 15)" in lost
