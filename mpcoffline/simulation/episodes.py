@@ -43,7 +43,7 @@ class Episodes:
     states_kept: Array
     actions_kept: Array
     least: Array
-    iterations: int
+    iterations: int = 0
 
 
 def iterations_of(controller: Controller) -> int:
