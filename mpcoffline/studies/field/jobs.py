@@ -40,7 +40,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "iql": Algorithm("IQL", peer=True, cost=2, largest=5_000),
     "cql": Algorithm("CQL", peer=True, cost=3, largest=5_000),
     # Only its time is measured: what a pass over the log takes where each transition solves two MPCs.
-    "mpcrl": Algorithm("mpcrl, LSTD-Q", cost=1, largest=1_000),
+    "mpcrl": Algorithm("mpcrl, LSTD-Q", cost=1),
 }
 #: With ``--search``: the same with the best of ten settings by closed loops on the plant, which no log gives.
 SEARCHED = {f"{name}, searched": name for name in ("td3+bc", "iql", "cql")}
