@@ -79,8 +79,8 @@ def _travel(report: Report, _: Fit) -> Iterator[str]:
             [f"{e.name} by {e.shares[2]:.1%} of its range a step ({e.shares[0]:.1%} in the log)" for e in busy]
         )
         yield (
-            f"The learned MPC moves {moved}: nothing in its cost speaks against that. Where it wears an actuator, give"
-            " changes of inputs a price (changes={name: weight} in a plant file, D= of QuadraticCost), or a limit"
+            f"The learned MPC moves {moved}: neither a price nor a rate limit holds it. Where that wears an actuator,"
+            " give changes of inputs a price (changes={name: weight} in a plant file, D= of QuadraticCost), or a limit"
             " (rate= of an input), and fit again."
         )
 

@@ -328,7 +328,7 @@ def _item(text: str) -> str:
 
 
 def _travel_text(travel: Travel) -> str:
-    logged, first, proposed = (f"{share:.1%}" if share == share else "?" for share in travel.shares)
+    logged, first, proposed = (f"{share:.1%}" if np.isfinite(share) else "?" for share in travel.shares)
     return f"{logged} of its range in the log, {first} MPC_1, {proposed} learned"
 
 

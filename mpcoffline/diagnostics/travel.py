@@ -45,6 +45,9 @@ def travels(mpc: MPC, table: TransitionTable, first: Episodes, proposal: Episode
         table: The transitions as they were logged.
         first: What MPC_1 does, on models of the log and with its measurement noise.
         proposal: What the controller does that is judged.
+
+    Returns:
+        One an input.
     """
     logged = np.asarray(table.actions, dtype=np.float64)
     goes_on = rows_before(table)[1:] > 0

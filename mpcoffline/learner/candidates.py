@@ -272,7 +272,7 @@ def tried(
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
     threads = torch.get_num_threads()
-    with Ahead(threads if threads > 1 else 0) as ahead:
+    with Ahead(threads if threads > 1 else 0) as ahead:  # one core has none to spare
         ahead.start(mpcs.values())
 
         def variants_ahead(good: Mapping[str, MPC], turn: int) -> Mapping[str, MPC]:

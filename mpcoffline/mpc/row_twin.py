@@ -29,8 +29,7 @@ class RowTwin:
 
     def __init__(self, function: ca.Function) -> None:
         large = TorchTwin(function) if expanded(function).n_instructions() > LARGE else None
-        self._torch = large if large is not None and large.in_layers else None
-        self._numpy = NumpyTwin(function) if self._torch is None else None
+        self._twin = large if large is not None and large.in_layers else NumpyTwin(function)
 
     def __call__(self, *inputs: Array) -> Array:
         """The first output, ``(..., m)``.
@@ -39,17 +38,16 @@ class RowTwin:
             *inputs: One array an input, ``(..., n_i)``; leading dimensions broadcast, so that parameters ``(n,)``
                 may go with states ``(B, nx)``.
         """
-        if self._torch is not None:
+        if isinstance(self._twin, TorchTwin):
             with torch.no_grad():
-                return np.asarray(self._torch(*(torch.tensor(each, dtype=torch.float64) for each in inputs)).numpy())
-        assert self._numpy is not None  # noqa: S101 -- one of them is; narrows the type
+                return np.asarray(self._twin(*(torch.tensor(each, dtype=torch.float64) for each in inputs)).numpy())
         shape = np.broadcast_shapes(*(each.shape[:-1] for each in inputs))
         count = int(np.prod(shape, dtype=int))
         columns = [_columns(each, shape) for each in inputs]
-        found = np.empty((self._numpy.n_out, count))
+        found = np.empty((self._twin.n_out, count))
         for k in range(0, count, _CHUNK):
             some = (each[:, k : k + _CHUNK] if each.shape[1] == count else each for each in columns)
-            found[:, k : k + _CHUNK] = self._numpy(*some)
+            found[:, k : k + _CHUNK] = self._twin(*some)
         return found.T.reshape(*shape, len(found))
 
 

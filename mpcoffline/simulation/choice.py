@@ -59,7 +59,7 @@ def choose(
         around: Where they are tried; at most two thirds of its starts are used to choose.
         variants: What is tried, too, of the three best after the first round (turn 0), of the best after the next (1).
         tell: Is told how many starts of how many are done, and what is tried.
-        preferred: Which one is taken where no other is clearly better, and always goes on until then.
+        preferred: Which one is taken where no other is clearly better; it goes on as long as that is so.
 
     Returns:
         The trials, and the name of the best.
@@ -88,7 +88,7 @@ def _chosen(
     def act(names: list[str], starts: slice) -> None:
         stage.act(names, trials, starts)
 
-    def still_good(end: int, turn: int = 0) -> list[str]:
+    def going_on(end: int, turn: int = 0) -> list[str]:
         labour = {name: stage.iterations(name) for name in left} if turn else {}
         good, most = _still_good(trials, left, end, preferred, labour), _STAY[min(turn, len(_STAY) - 1)]
         return [name for place, name in enumerate(good) if place < most or name == preferred]
@@ -96,19 +96,19 @@ def _chosen(
     for turn, end in enumerate(ends):
         act(left, slice(begin, end))
         if turn < len(_VARIED):  # what is better may be better still
-            good = still_good(end)[: _VARIED[turn]]
+            good = going_on(end)[: _VARIED[turn]]
             more = variants({name: mpcs[name] for name in good}, turn)
             mpcs.update(more)
             stage.add(more)
             trials, left = trials.with_names(list(more)), [*left, *more]
             act(list(more), slice(0, end))
-        left, begin = [FIRST, *still_good(end, turn)], end
+        left, begin = [FIRST, *going_on(end, turn)], end
         if left == [FIRST]:
             return trials.judged_from(begin), FIRST
     total = usual
     if len(left) > 2 and len(around.rows) > usual:
         act(left, slice(begin, usual))
-        left, begin, total = [FIRST, *still_good(usual, len(ends))], usual, len(around.rows)
+        left, begin, total = [FIRST, *going_on(usual, len(ends))], usual, len(around.rows)
     act([FIRST], slice(begin, total))
     chosen = FIRST
     for name in sorted(left[1:], key=lambda name: name != preferred)[:_JUDGED]:

@@ -8,7 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.mpc.numpy_twin import NumpyTwin
 from mpcoffline.mpc.row_twin import RowTwin
+from mpcoffline.mpc.torch_twin import TorchTwin
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(0)
@@ -42,7 +44,7 @@ def test_rows_are_what_casadi_gives_for_each(make: object, count: int) -> None:
     p, one = RNG.uniform(1.0, 2.0, (count, 2)), np.array([1.5, 0.7])
     np.testing.assert_allclose(twin(x, u, p), by_casadi(function, x, u, p), rtol=1e-12, atol=1e-13)
     np.testing.assert_array_equal(twin(x, u, one), twin(x, u, np.tile(one, (count, 1))))
-    assert twin._numpy is None if make is network else twin._torch is None
+    assert isinstance(twin._twin, TorchTwin if make is network else NumpyTwin)
 
 
 def test_leading_dimensions_broadcast() -> None:
