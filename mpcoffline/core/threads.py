@@ -23,15 +23,33 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
-def side_by_side(jobs: Sequence[Callable[[], T]]) -> list[T]:
-    """What some jobs give, in their order, done by as many threads as torch has.
+def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) -> list[T]:
+    """What some jobs give, in their order, done by several threads, of which the one that asks is one.
 
-    For what waits for numpy's matrices, which let other threads run. Jobs share nothing that one of them changes.
+    For what waits for numpy's matrices or for C, which let other threads run. Jobs share nothing that one of them
+    changes. Were all done by new threads while this one waits, two of them would often end up on one core: the kernel
+    places new threads where there is room, and this one's core has none yet.
+
+    Args:
+        jobs: What to do; whoever is free takes the next one.
+        workers: How many threads; as many as torch has by default.
     """
-    import torch
+    if workers is None:
+        import torch
 
-    workers = min(torch.get_num_threads(), len(jobs))
+        workers = torch.get_num_threads()
+    workers = min(workers, len(jobs))
     if workers < 2:
         return [job() for job in jobs]
-    with ThreadPoolExecutor(workers) as pool:
-        return [done.result() for done in [pool.submit(job) for job in jobs]]
+    waiting, done = iter(range(len(jobs))), dict[int, T]()
+
+    def work() -> None:
+        for i in waiting:  # a range's iterator is C: no two threads are given the same
+            done[i] = jobs[i]()
+
+    with ThreadPoolExecutor(workers - 1) as pool:
+        others = [pool.submit(work) for _ in range(workers - 1)]
+        work()
+        for other in others:
+            other.result()
+    return [done[i] for i in range(len(jobs))]

@@ -99,12 +99,20 @@ class NetworkCost(Component):
 
     def terminal_expression(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
         """T as a CasADi scalar; ``p["W"]`` is the factor C of W = C C'."""
-        signal = difference("x", x, p["mean"]) / p["std"]
+        signal = self.standardised(x, p)
         for k in range(self.n_layers):
             signal = ca.mtimes(p[f"weights_{k}"], signal) + p[f"biases_{k}"]
             if k < self.n_layers - 1:
                 signal = signal / ca.sqrt(1.0 + signal**2)
-        return p["offset"] + p["scale"] * signal + ca.sumsqr(ca.mtimes(p["W"].T, x - p["x_ref"]))
+        return self.of_output(signal, x, p)
+
+    def standardised(self, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """What the network sees of states, ``(x - mean) / std``."""
+        return difference("x", x, p["mean"]) / p["std"]
+
+    def of_output(self, output: ca.SX, x: ca.SX, p: Mapping[str, ca.SX]) -> ca.SX:
+        """T, where the network's output is known."""
+        return p["offset"] + p["scale"] * output + ca.sumsqr(ca.mtimes(p["W"].T, x - p["x_ref"]))
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:

@@ -9,6 +9,7 @@ import torch
 from mpcoffline.core.types import Array
 
 from .expressions import expanded
+from .layers import may_be_layered
 from .numpy_twin import NumpyTwin
 from .torch_twin import LARGE, TorchTwin
 
@@ -28,7 +29,8 @@ class RowTwin:
     """
 
     def __init__(self, function: ca.Function) -> None:
-        large = TorchTwin(function) if expanded(function).n_instructions() > LARGE else None
+        flat = expanded(function)
+        large = TorchTwin(function) if flat.n_instructions() > LARGE and may_be_layered(flat) else None
         self._twin = large if large is not None and large.in_layers else NumpyTwin(function)
 
     def __call__(self, *inputs: Array) -> Array:

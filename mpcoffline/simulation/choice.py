@@ -43,9 +43,9 @@ def choose(
 ) -> tuple[Trials, str]:
     """Tries MPCs on the models of the log and names the best.
 
-    In rounds, each with more starts: after each, those leave that cost clearly more than the best; from the second one
-    on those, too, that take their solver over four times its iterations, and what comes after the six best, then the
-    four best. Where the last one leaves several that are not alike, all usual starts choose and the spare ones judge.
+    In rounds, each with more starts: after each, those leave that cost clearly more than the best, or take their solver
+    over four times its iterations; from the second one on, what comes after the six best, then the four best. Where the
+    last one leaves several that are not alike, all usual starts choose and the spare ones judge.
     The best has the least mean cost on the median model, of those that have a vote; but first comes the preferred one,
     where nothing has shown it to be worse. It is taken if it costs no more than ``"MPC_1"`` by both regressions of the
     cost, and the starts that are left do not say otherwise (:meth:`Trials.improves`), else the next best is asked;
@@ -89,7 +89,7 @@ def _chosen(
         stage.act(names, trials, starts)
 
     def going_on(end: int, turn: int = 0) -> list[str]:
-        labour = {name: stage.iterations(name) for name in left} if turn else {}
+        labour = {name: stage.iterations(name) for name in left}
         good, most = _still_good(trials, left, end, preferred, labour), _STAY[min(turn, len(_STAY) - 1)]
         return [name for place, name in enumerate(good) if place < most or name == preferred]
 
@@ -252,8 +252,8 @@ def quick_policy(mpc: MPC) -> MPCPolicy:
 def _still_good(trials: Trials, names: list[str], end: int, preferred: str, labour: Mapping[str, float]) -> list[str]:
     """Those, but MPC_1, that are not clearly worse than the best; the best first, or the preferred one if as good.
 
-    Of those that are alike, the first. Where labour is known, iterations a start, none that takes much more of it than
-    the best: whoever hands it out would wait for nothing.
+    Of those that are alike, the first; none that takes much more labour, iterations a start, than the best: whoever
+    hands it out would wait for nothing.
     """
     differences = {name: trials.differences(name)[trials.votes][:, :end] for name in names}
     score = {name: float(np.median(each.mean(axis=1))) for name, each in differences.items()}
@@ -261,7 +261,7 @@ def _still_good(trials: Trials, names: list[str], end: int, preferred: str, labo
     trifle = _TRIFLE * abs(score[best])
 
     def near(name: str) -> bool:
-        if labour and name != best and labour[name] > _LABOUR * max(labour[best], 1.0):
+        if name != best and labour[name] > _LABOUR * max(labour[best], 1.0):
             return False
         gap = differences[name] - differences[best]
         mean, error = gap.mean(axis=1), gap.std(axis=1) / np.sqrt(end)

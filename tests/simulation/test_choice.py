@@ -80,7 +80,7 @@ def test_what_takes_much_more_of_its_solver_than_the_best_leaves(around: Surroun
     def left(gaps: dict[str, float], labour: dict[str, float]) -> list[str]:
         return choice._still_good(made_up(around, gaps, 0.3), list({FIRST: 0.0, **gaps}), 16, "", labour)
 
-    assert left(gaps, {}) == ["quick", "creeping"]
+    assert left(gaps, dict.fromkeys(labour, 100.0)) == ["quick", "creeping"]
     assert left(gaps, labour) == ["quick"]
     assert left(gaps, {**labour, "creeping": 350.0}) == ["quick", "creeping"]
     assert left({**gaps, "dear": -20.0}, labour) == ["dear"]

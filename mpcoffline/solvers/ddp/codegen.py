@@ -22,12 +22,15 @@ from mpcoffline.solvers.scaling import costs_of
 from .elimination import value_and_jacobian
 from .emission import emit, literal
 from .layered import LayeredCode
+from .terminal import COMPOSED, TerminalNetwork
 
 _LARGEST_BENT = 2000  # nodes of a model whose second derivatives are taken: they double the code
 # Inlined, the time of a cart-pole's expansion depends on where the linker puts it, by a quarter.
 _ATTRIBUTES = {"gen_q": "NOINLINE "}
 # What is emitted of a model with layers instead: the rest of the functions, which are composed of it and the layers.
 _WITH_LAYERS = {"gen_step": "gen_cost", "gen_q": "gen_q_of_model"}
+# Likewise of a terminal cost that is a network.
+_WITH_NETWORK = {"gen_final": "gen_final_of_network", "gen_final_expand": "gen_final_expand_of_network"}
 # What was generated last, by what it was generated from: the MPCs of a fit differ in theta, bounds and horizon, mostly.
 _KNOWN: dict[tuple[object, ...], str] = {}
 _MOST_KNOWN = 32
@@ -106,7 +109,12 @@ def _generated(mpc: MPC, problem: _Problem) -> str:
     z = ca.vertcat(x, u)
     layers = _layers(mpc, theta) if ca.n_nodes(reached) > _LARGEST_BENT else None
     _check_size(mpc, ca.vertcat(cost, final), layers.n_scalars if layers else ca.n_nodes(reached))
-    final_hessian, final_gradient = ca.hessian(final, x)
+    network, found = TerminalNetwork.of(mpc, x, theta), ca.SX()
+    if network is None:
+        final_hessian, final_gradient = ca.hessian(final, x)
+    else:
+        final, found = network.cost, ca.SX.sym("found", network.size)  # in which network_expand hands it over
+        final_gradient, final_hessian = network.expansion(found)
     hessian, slope = ca.hessian(cost, z)
     array = ca.SX.sym("model", mpc.nx * (1 + mpc.nx + mpc.nu))  # in which model_slopes hands them over
     linearised = value_and_jacobian(reached, z, theta) if layers is None else _in_array(mpc, array)
@@ -134,24 +142,29 @@ def _generated(mpc: MPC, problem: _Problem) -> str:
         inputs["gen_q"].append(array)
         inputs |= {name: [read] for name, (read, _) in layers.functions.items()}
         outputs |= {name: given for name, (_, given) in layers.functions.items()}
+    if network is not None:
+        inputs |= {"gen_final": [x, network.y], "gen_final_expand": [x, found], "gen_network_inputs": [x]}
+        outputs["gen_network_inputs"] = _stacked(network.z)
     if kept is not None:
         for name, (read, given) in limit_functions(kept, x, u).items():
             inputs[name], outputs[name] = read, given
     bodies, symbols, prepared = _hoisted(list(outputs.values()), theta)
     parameters = ca.vertcat(theta, symbols)
     convex = int(as_is), int(promised[1])
-    names = {} if layers is None else _WITH_LAYERS
+    names = (_WITH_LAYERS if layers else {}) | (_WITH_NETWORK if network else {})
     parts = [
         f"#define STAGE_CONVEX {convex[0]}\n#define TERMINAL_CONVEX {convex[1]}",
         limit_constants(kept),
         f"#define NX {mpc.nx}\n#define NU {mpc.nu}\n#define NP {mpc.space.size}\n#define NQ {symbols.numel()}",
         *([] if layers is None else [text("layers.c"), *layers.maps()]),
+        *([] if network is None else [network.tables(), text("network.c")]),
         emit("gen_prepare", [theta], prepared),
         *(
             emit(names.get(name, name), [*inputs[name], parameters], body, _ATTRIBUTES.get(name, ""))
             for name, body in zip(outputs, bodies, strict=True)
         ),
         *([] if layers is None else [layers.drivers(), _composed(stage_expansion=not as_is)]),
+        *([] if network is None else [COMPOSED]),
     ]
     return "\n\n".join(parts)
 

@@ -20,6 +20,7 @@ _PARTIALS: dict[int, Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ...]]] = {
     ca.OP_DIV: lambda f, a, b: (1 / b, -f / b),
     ca.OP_NEG: lambda f, a, b: (ca.SX(-1),),
     ca.OP_SQ: lambda f, a, b: (2 * a,),
+    ca.OP_SQRT: lambda f, a, b: (0.5 / f,),
     ca.OP_TWICE: lambda f, a, b: (ca.SX(2),),
 }
 

@@ -22,6 +22,7 @@ static inline vd vd_max(vd a, vd b) { return a > b ? a : b; }
 #define vd_bool(mask) ((mask) ? 1.0 : 0.0) /* a function that no model uses is a warning of clang's */
 #define vd_abs fabs
 #define vd_sqrt sqrt
+#define vd_rsqrt(a) (1.0 / sqrt(a))
 #define vd_exp exp
 #define vd_log log
 #define vd_log1p log1p

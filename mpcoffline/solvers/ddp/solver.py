@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import ctypes
 import time
-from concurrent.futures import ThreadPoolExecutor
 from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
+from mpcoffline.core.threads import side_by_side
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import SOLVERS, Solution, Solver
@@ -384,8 +385,8 @@ class DDPSolver(Solver):
 
         if workers == 1:
             return work(0)
-        with ThreadPoolExecutor(workers) as pool:  # ctypes releases the interpreter lock
-            return sum(pool.map(work, range(workers)))
+        # ctypes releases the interpreter lock
+        return sum(side_by_side([partial(work, first) for first in range(workers)], workers))
 
 
 def _rows(theta: Array, chosen: NDArray[np.bool_]) -> Array:

@@ -33,6 +33,16 @@ static inline int vl_any(vl mask) {
     return any != 0;
 #endif
 }
+
+/* 1 / sqrt(a) of normal positive numbers, a unit in the last place off: Newton's method, from a first guess by half the
+ * exponent. A root and a division take four times as long. NaN of infinity. */
+static INLINE vd vd_rsqrt(vd a) {
+    typedef unsigned long long vu __attribute__((vector_size(8 * LANES)));
+    vd y = (vd)(0x5fe6eb50c7b537a9ULL - ((vu)a >> 1)), h = 0.5 * a;
+    for (int i = 0; i < 3; ++i) y *= 1.5 - h * y * y;
+    return y + y * (0.5 - h * y * y);
+}
+
 static inline vd vd_bool(vl mask) { return vd_select(mask, V(1.0), V(0.0)); }
 
 #define LANEWISE(name, call) \
