@@ -248,6 +248,12 @@ class Plant:
         symbols = ([f"\\cos{c.symbol}", f"\\sin{c.symbol}"] if c.angle else [c.symbol] for c in self.states)
         return tuple(f"${symbol}$" for pair in symbols for symbol in pair)
 
+    @property
+    def entries(self) -> tuple[tuple[str, str], ...]:
+        """Names and units of the entries of y, as text; an angle has a cosine and a sine."""
+        pairs = ([(f"cos {c.name}", ""), (f"sin {c.name}", "")] if c.angle else [(c.name, c.unit)] for c in self.states)
+        return tuple(entry for pair in pairs for entry in pair)
+
     def coordinate(self, name: str) -> State | Input:
         """The state or input of that name."""
         inputs = [c for c in self.inputs if c.name == name]

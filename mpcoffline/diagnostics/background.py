@@ -138,12 +138,16 @@ class Background:
 
 
 def names_of(dataset: Any, mpc: MPC) -> Names:
-    """Those that the model carries, else those of the task that a data set is of, where it is known here."""
+    """Those that the model carries, else those of the task that a data set is of, where it is known here.
+
+    MPC_1 of a task carries the task's names; the symbols of figures are nearer to the equations.
+    """
     layout, numbered = mpc.layout, Names.numbered(mpc.layout)
-    if layout.labels.states or layout.labels.inputs:
-        return Names(tuple(map(str, layout.y_labels)), tuple(map(str, layout.u_labels)))
     spec = getattr(getattr(dataset, "spec", None), "env_spec", None)
     plant = None if spec is None else find_plant(str(spec.id))
+    named = bool(layout.labels.states or layout.labels.inputs)
+    if named and (plant is None or layout.labels.states != plant.entries):
+        return Names(tuple(map(str, layout.y_labels)), tuple(map(str, layout.u_labels)))
     if spec is None or plant is None or (len(plant.observations), len(plant.inputs)) != (mpc.ny, mpc.nu):
         return numbered
     inputs = tuple(_plain(each.label) for each in plant.inputs)

@@ -186,13 +186,14 @@ class OneStepProblem:
         Errors e beyond c = 1000 count c (1 + log(e / c)): a few absurd ones do not decide what the model is.
         """
         predicted, slopes = self.model.with_slopes(self.rows.x, self.rows.u, self.theta(z))
-        errors = (predicted - self.rows.reached) / self.scale
-        jacobian = slopes[:, :, self.free] * self.slopes(z)[..., None, :] / self.scale[:, None]
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is the wall
+            errors = (predicted - self.rows.reached) / self.scale
+            jacobian = slopes[:, :, self.free] * self.slopes(z)[..., None, :] / self.scale[:, None]
         finite = np.isfinite(errors) & np.isfinite(jacobian).all(axis=2)
         errors, jacobian = np.where(finite, errors, ABSURD), np.where(finite[:, :, None], jacobian, 0.0)
         beyond = np.maximum(np.abs(errors) / ABSURD, 1.0)
         if (beyond > 1.0).any():
-            errors, jacobian = errors * (1.0 + np.log(beyond)) / beyond, jacobian / beyond[:, :, None]
+            errors, jacobian = errors / beyond * (1.0 + np.log(beyond)), jacobian / beyond[:, :, None]
         return errors, jacobian
 
     def descend(self, start: Array, prior: float, max_iterations: int) -> _Descent:

@@ -154,9 +154,10 @@ class MultiStepProblem:
                 ahead, F, df = (part.full().T for part in self._step((x * scale).T, u[t].T, theta))
                 x = ahead / scale
                 if slopes:
-                    F = F.reshape(n, nx, nx) * scale / scale[:, None]
-                    in_theta = F @ in_theta + df.reshape(n, nx, p) * in_z / scale[:, None]
-                    in_start = F @ in_start
+                    with np.errstate(over="ignore", invalid="ignore"):  # what is wild counts no more
+                        F = F.reshape(n, nx, nx) * scale / scale[:, None]
+                        in_theta = F @ in_theta + df.reshape(n, nx, p) * in_z / scale[:, None]
+                        in_start = F @ in_start
                     wild = ~(np.isfinite(in_theta).all(axis=(1, 2)) & np.isfinite(in_start).all(axis=(1, 2)))
                     in_theta[wild], in_start[wild] = 0.0, 0.0
         error = np.stack(errors)

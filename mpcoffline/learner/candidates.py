@@ -26,6 +26,7 @@ from mpcoffline.simulation.trials import Trials
 from mpcoffline.solvers.ddp import Ahead
 
 from .effort import Effort, core_seconds
+from .fineness import fine_enough
 
 if TYPE_CHECKING:
     from mpcoffline.core.progress import Bars
@@ -214,18 +215,19 @@ def candidates_of(
     """
     known, nominal, soft = run.known, learner.nominal_mpc, learner.softening
     between = {} if learner.candidate == FULL else run.method.candidates(known)
-    between = {**between, **also} if between or learner.candidate != "auto" else between
     if learner.candidate == "auto":
-        show, variants = partial(bars.show, "choosing on models of the log"), partial(run.method.variants, known)
+        show, begun = partial(bars.show, "choosing on models of the log"), core_seconds()
         if not between:
             if learner.polish:
                 logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
             return None
         how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
         how |= {"kept": kept, "learned_in": learned_in, "sensors": learner.sensors}
-        how["ready"] = _as_it_is if soft is None else soft
-        return tried(nominal, known, between, table, variants, show, **how)
-    mpcs = {FIRST: nominal, **between, FULL: known.mpc}
+        how["ready"] = ready = _as_it_is if soft is None else soft
+        known, between = fine_enough(known, between, table, ready)
+        variants = partial(run.method.variants, known)
+        return tried(nominal, known, {**between, **also}, table, variants, show, begun=begun, **how)
+    mpcs = {FIRST: nominal, **between, **also, FULL: known.mpc}
     for turn in (1, 0, 1):  # a variant, and one of a variant
         if learner.candidate not in mpcs:
             alike = {name: mpc for name, mpc in mpcs.items() if learner.candidate.startswith(f"{name}, ")}
@@ -249,6 +251,7 @@ def tried(
     kept: Kept | None = None,
     learned_in: float = 0.0,
     sensors: Sensors | None = None,
+    begun: float | None = None,
 ) -> Candidates:
     """Tries MPC_1, the whole fit and what lies between on models of the log, and chooses.
 
@@ -266,8 +269,9 @@ def tried(
         kept: What an interrupted search over the weights has found, and where more of it is kept.
         learned_in: How long the regressions took, in s of one core.
         sensors: What the MPCs will see in place of states.
+        begun: When the choice began, in s of one core; now by default.
     """
-    begun = core_seconds()
+    begun = core_seconds() if begun is None else begun
     mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")

@@ -120,21 +120,22 @@ class Flow:
         return np.asarray(np.linalg.eigvals(slope) if np.isfinite(slope).all() else [], dtype=np.complex128)
 
 
-def choice_on(flow: Flow, x: Array, u: Array, reached: Array, least: int = 1) -> Choice:
-    """The substeps that logged rows ask for.
+def choice_on(flow: Flow, x: Array, u: Array, reached: Array, least: int = 1, spread: Array | None = None) -> Choice:
+    """The substeps that rows ask for, logged ones or planned ones.
 
     Args:
         flow: The ODE's solution.
         x: States, ``(B, nx)``.
         u: Inputs, ``(B, nu)``.
-        reached: States after them, ``(B, nx)``; their increments have the spread that errors are measured in.
+        reached: States after them, ``(B, nx)``.
         least: The fewest substeps.
+        spread: Of the increments that errors are measured in, ``(nx,)``; by default that of these rows.
     """
     known = flow.defined(x, u)
     if not known.any():
         return Choice(least)
     x, u, reached = x[known], u[known], reached[known]
-    spread, coarse = increments_scale(x, reached), {least: flow(x, u, least)}
+    spread, coarse = increments_scale(x, reached) if spread is None else spread, {least: flow(x, u, least)}
 
     def compared(n: int) -> Doubling:
         coarse[2 * n] = flow(x, u, 2 * n)

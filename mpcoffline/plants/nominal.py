@@ -13,7 +13,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.envs import PLANTS, Plant
 from mpcoffline.envs.episode import DISCOUNT
-from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
+from mpcoffline.mpc import MPC, Label, Labels, Model, NormCost, Parameter, QuadraticCost
 
 
 def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC:
@@ -61,6 +61,9 @@ def nominal_mpc(env_id: str, alpha: float = 0.0, seed: int | None = None) -> MPC
             parameters=_parameters(plant, alpha, seed),
             discrete=plant.discrete,
             integrator="auto" if plant.discrete else "rk4",  # the plant's own step
+            labels=Labels(
+                tuple(Label(*entry) for entry in plant.entries), tuple(Label(c.name, c.unit) for c in plant.inputs)
+            ),
         ),
         stage_cost=QuadraticCost(
             np.diag(cost.weights), np.diag(cost.input_weights), x_ref=target, u_ref=cost.input_target

@@ -253,11 +253,16 @@ def test_the_header_documents_names_and_units(tmp_path: Path) -> None:
     assert re.search(r"double model_m; /\* model.m: number, in kg \*/", header)
     assert re.search(r"double stage_cost_W\[6\]; /\* .*C C'", header)
     assert "every 0.05 s" in header
-    assert "u[0]: from -2 to 2" in header
-    assert "y[0]" not in header.split("*/")[0]  # nobody gave names
+    about = header.split("*/")[0]
+    assert re.findall(r"y\[\d\]: .*", about) == ["y[0]: cos phi", "y[1]: sin phi", "y[2]: phid [rad/s]"]
+    assert "u[0], u [N m]: from -2 to 2" in about
     export_c(MPCPolicy(mpc_of("network")), tmp_path / "network")
     header = (tmp_path / "network" / "mpc_controller.h").read_text()
     assert re.search(r"double terminal_cost_weights_1\[36\]; /\* .*shape \(6, 6\), row by row \*/", header)
+    export_c(MPCPolicy(mpc_of("late inputs")), tmp_path / "nameless")
+    about = (tmp_path / "nameless" / "mpc_controller.h").read_text().split("*/")[0]
+    assert "u[0]: from -1 to 1" in about
+    assert "y[0]" not in about  # nobody gave names
     source = (tmp_path / "mpc_controller.c").read_text()
     assert "malloc" not in source
     assert set(re.findall(r"#include\s+(\S+)", source)) == {'"mpc_controller.h"', "<math.h>", "<stdint.h>"}

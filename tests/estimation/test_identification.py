@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from typing import Any
 
 import casadi as ca
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 import mpcoffline
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError
 from mpcoffline.datasets import TransitionTable
-from mpcoffline.estimation.identification import IdentificationConfig, identify_one_step
+from mpcoffline.estimation.identification import ABSURD, IdentificationConfig, OneStepProblem, identify_one_step
+from mpcoffline.estimation.rows import Rows
 from mpcoffline.mpc import MPC, Model, NormCost, Parameter, QuadraticCost
 from mpcoffline.plants.nominal import nominal_mpc
 
@@ -252,3 +254,16 @@ def test_an_earlier_model_is_where_the_search_begins_too() -> None:
     assert mpcoffline.estimation.identify(wavy(6.8), table, start=wavy(1.2)).theta[0] == pytest.approx(7.0, abs=1e-3)
     other = linear_mpc(np.eye(2), np.ones((2, 1)))
     np.testing.assert_array_equal(mpcoffline.estimation.identify(wavy(1.2), table, start=other).theta, cold.theta)
+
+
+def test_errors_as_large_as_numbers_are_finite_and_nothing_is_said() -> None:
+    """f(1e6) = 1e308 counts by its logarithm, f(1e7) is not finite: a wall. Neither warns."""
+    far = Model(lambda x, u, p: p["a"] * 1e302 * x + u, 1, 1, 0.1, {"a": Parameter(1.0, low=0.1)}, discrete=True)
+    x = np.array([[1e6], [1e6], [1e7]])
+    problem = OneStepProblem(mpc_of(far), Rows(x, np.zeros((3, 1)), x + np.array([[0.0], [1.0], [2.0]])))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        errors, jacobian = problem.linearised(np.zeros(1))
+    logarithm = 308.0 * np.log(10.0) - np.log(problem.scale[0]) - np.log(ABSURD)
+    assert errors[:, 0] == pytest.approx([ABSURD * (1.0 + logarithm)] * 2 + [ABSURD])
+    assert jacobian[:, 0, 0] == pytest.approx([ABSURD, ABSURD, 0.0])

@@ -170,3 +170,13 @@ def test_errors_of_parameters_of_either_sign_and_of_zero(monkeypatch: pytest.Mon
     assert (float(blocks["model.l"].low[0]), float(blocks["model.l"].high[0])) == (-np.inf, np.inf)
     with pytest.raises(InvalidArgumentError, match="from 0 to below 4, so that no parameter can vanish"):
         nominal_mpc(PENDULUM, alpha=4.0)
+
+
+def test_it_carries_the_names_of_the_task() -> None:
+    """In the order of the observation, which is a float32 of x, xd, the angle's cosine and sine, and its speed."""
+    layout = nominal_mpc(CARTPOLE, alpha=0.0).layout
+    assert [str(label) for label in layout.y_labels] == ["x [m]", "xd [m/s]", "cos phi", "sin phi", "phid [rad/s]"]
+    assert [str(label) for label in layout.u_labels] == ["u [N]"]
+    state = np.array([0.1, 0.2, 0.3, 0.4])
+    observation, _ = gym.make(CARTPOLE).reset(options={"state": state})
+    assert observation == pytest.approx([0.1, 0.2, np.cos(0.3), np.sin(0.3), 0.4])

@@ -61,10 +61,7 @@ def names_of(dataset: MinariDataset) -> tuple[str, ...]:
     plant = find_plant(str(spec.id)) if spec is not None else None
     if plant is None or [(len(plant.observations),), (len(plant.inputs),)] != shapes:
         return ()
-    names: list[str] = []
-    for state in plant.states:
-        names += [f"cos {state.name}", f"sin {state.name}"] if state.angle else [_labelled(state.name, state.unit)]
-    return (*names, *(_labelled(each.name, each.unit) for each in plant.inputs))
+    return tuple(_labelled(*entry) for entry in (*plant.entries, *((each.name, each.unit) for each in plant.inputs)))
 
 
 def _stored(dataset: MinariDataset) -> Any:
