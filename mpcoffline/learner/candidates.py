@@ -278,6 +278,8 @@ def tried(
     threads = torch.get_num_threads()
     with Ahead(threads if threads > 1 else 0) as ahead:  # one core has none to spare
         ahead.start(mpcs.values())
+        if threads > 1:  # which variants will be asked for is not known yet; but most of them are the same code
+            ahead.start(variants({name: mpc for name, mpc in mpcs.items() if name != FIRST}, 0).values())
 
         def variants_ahead(good: Mapping[str, MPC], turn: int) -> Mapping[str, MPC]:
             found = variants(good, turn)
