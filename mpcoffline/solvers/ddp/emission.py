@@ -109,9 +109,8 @@ class _Statements:
 
     def __init__(self, name: str, program: list[Instruction], piece: int, size: int) -> None:
         self._name, self._program, self._piece, self.size = name, program, piece, size
-        self._read: list[
-            dict[int, int]
-        ] = []  # of each instruction: the places that it reads, and whose values they are
+        # Of each instruction: the places that it reads, and whose values they are.
+        self._read: list[dict[int, int]] = []
         value_in: dict[int, int] = {}  # by place in the work vector: the instruction whose value is there
         for k, (op, sources, targets, _) in enumerate(program):
             own = op in (ca.OP_INPUT, ca.OP_CONST)
@@ -121,9 +120,8 @@ class _Statements:
         self._floors = self._positive()
         self._divided, self._last_read = self._readers()
         self._places: dict[int, int] = {}  # of reciprocals that a later piece reads
-        self._roots: set[tuple[int, str, int]] = (
-            set()
-        )  # that are known: piece, half or quarter power, number of the base
+        # Roots that are known: piece, half or quarter power, number of the base.
+        self._roots: set[tuple[int, str, int]] = set()
         self.texts: list[str] = [self._text(k) for k in range(len(program))]
 
     def _positive(self) -> list[float]:
