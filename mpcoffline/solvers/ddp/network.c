@@ -1,5 +1,6 @@
 /* The network of T as loops over its weights, which are parameters: A_k row by row at p + network[k].weights, as
  * a_k = A_k h_{k-1} + b_k, h_k = sigma(a_k), sigma(a) = a / sqrt(1 + a^2); one output y = A h, its bias left to others. */
+
 /* The derivative of one result by 8 inputs, or by what is left of them: a row times a matrix. */
 static INLINE void network_tile(int width, int columns, const vd *row, const vd *D, vd *out) {
     vd s[8];

@@ -14,6 +14,8 @@ from mpcoffline.mpc.networks import NetworkCost
 from mpcoffline.mpc.seen import terminal_expression
 from mpcoffline.solvers.scaling import split_constant
 
+_MOST = 1 << 14  # derivatives of hidden results: a megabyte of vectors
+
 
 @dataclass(frozen=True)
 class TerminalNetwork:
@@ -35,9 +37,15 @@ class TerminalNetwork:
 
     @classmethod
     def of(cls, mpc: MPC, x: ca.SX, theta: ca.SX) -> TerminalNetwork | None:
-        """That of an MPC, in symbols of its state and its parameters; None for a terminal cost of another kind."""
+        """That of an MPC, in symbols of its state and its parameters.
+
+        None for a terminal cost of another kind, and for networks whose derivatives do not fit on a thread's stack.
+        """
         cost = mpc.terminal_cost
         if type(cost) is not NetworkCost or cost.n_layers < 2:
+            return None
+        hidden = sum(block.shape[0] for block in cost.space if block.name.startswith("biases_")) - 1
+        if hidden * cost.nx > _MOST:
             return None
         y, one = ca.SX.sym("y"), ca.SX.sym("one")
         own = mpc.space.slices

@@ -12,6 +12,7 @@ from hypothesis import given, settings, strategies as st
 from mpcoffline.mpc import MPC, Model, QuadraticCost
 from mpcoffline.mpc.networks import NetworkCost
 from mpcoffline.solvers import make_solver
+from mpcoffline.solvers.ddp import codegen, terminal
 from mpcoffline.solvers.ddp.codegen import generated
 from mpcoffline.solvers.ddp.terminal import TerminalNetwork
 from mpcoffline.solvers.scaling import costs_of
@@ -23,7 +24,7 @@ def network(nx: int, hidden: tuple[int, ...], seed: int = 0, delay: int = 0) -> 
     """A stable plant whose terminal cost is a random network, with all that one has."""
     rng = np.random.default_rng(seed)
     A = ca.DM(0.9 * np.eye(nx) + 0.02 * rng.normal(size=(nx, nx)))
-    terminal = NetworkCost.random(
+    cost = NetworkCost.random(
         nx,
         hidden,
         seed=seed,
@@ -37,7 +38,7 @@ def network(nx: int, hidden: tuple[int, ...], seed: int = 0, delay: int = 0) -> 
     return MPC(
         Model(lambda x, u, p: A @ x + 0.1 * ca.sin(u[0]), nx, 1, 0.1, discrete=True, delay=delay),
         QuadraticCost(np.eye(nx), np.eye(1)),
-        terminal,
+        cost,
         horizon=5,
         discount=0.9,
         action_low=[-1.0],
@@ -64,11 +65,11 @@ def test_derivatives_are_put_together_as_casadi_has_them(shape: tuple[int, tuple
     assert parts is not None
     whole = costs_of(mpc, x, ca.SX.sym("u"), theta).terminal
     # y as the expression that the cost is of, without its bias
-    terminal = mpc.terminal_cost
-    own = terminal.space.symbols(theta[mpc.space.slices["terminal_cost.weights_0"].start :])
-    n = terminal.n_layers
+    of_mpc = mpc.terminal_cost
+    own = of_mpc.space.symbols(theta[mpc.space.slices["terminal_cost.weights_0"].start :])
+    n = of_mpc.n_layers
     blind = {f"biases_{n - 1}": ca.SX(0), "offset": ca.SX(0), "scale": ca.SX(1), "W": ca.SX(mpc.nx, mpc.nx)}
-    y = terminal.terminal_expression(x, {**own, **blind})
+    y = of_mpc.terminal_expression(x, {**own, **blind})
     z = ca.SX.sym("z", mpc.nx)
     of_z = ca.substitute(y, x, own["mean"] + own["std"] * z)
     hessian, gradient = ca.hessian(of_z, z)
@@ -113,9 +114,23 @@ def test_other_terminal_costs_are_written_out() -> None:
         """May have another expression."""
 
     mpc = network(2, (4, 4))
-    x, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("theta", mpc.space.size)
     own = Own.__new__(Own)
     own.__dict__.update(mpc.terminal_cost.__dict__)
-    for terminal in (QuadraticCost(np.eye(2)), own):
-        other = replace(mpc, terminal_cost=terminal)
+    for cost in (QuadraticCost(np.eye(2)), own):
+        other = replace(mpc, terminal_cost=cost)
+        x, theta = ca.SX.sym("x", other.nx), ca.SX.sym("theta", other.space.size)
         assert TerminalNetwork.of(other, x, theta) is None
+
+
+def test_what_does_not_fit_on_a_stack_is_written_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """16 derivatives of hidden results; the solutions are the same."""
+    mpc, x = network(2, (4, 4)), np.random.default_rng(1).normal(size=(4, 2))
+    loops = make_solver(mpc, "ddp").solve(x)
+    assert "network_expand" in generated(mpc)
+    monkeypatch.setattr(terminal, "_MOST", 15)
+    codegen._KNOWN.clear()
+    assert "network_expand" not in generated(mpc)
+    written_out = make_solver(mpc, "ddp").solve(x)
+    codegen._KNOWN.clear()
+    np.testing.assert_allclose(loops.u, written_out.u, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(loops.value, written_out.value, rtol=1e-14)
