@@ -38,7 +38,8 @@ def rows_of(text: str, wanted: dict[str, Any]) -> tuple[list[str], Rows]:
         ValueError: If the page has no such table or column.
     """
     if wanted.get("shares"):
-        return ["share"], {what: [int(a) / int(b)] for what, a, b in _SHARE.findall(text.partition("\n## ")[0])}
+        found = _SHARE.findall(text.partition("\n## ")[0])
+        return ["share"], {what: [int(a) / int(b)] for what, a, b in found if int(b)}  # of none there is no share
     begin = text.index(wanted["after"]) if "after" in wanted else 0
     header, *lines = _table(text[begin:])
     if column := wanted.get("counts"):

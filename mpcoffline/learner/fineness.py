@@ -88,6 +88,7 @@ def _policies(mpcs: list[MPC]) -> list[MPCPolicy]:
     return policies
 
 
+@np.errstate(over="ignore", invalid="ignore")  # where a plan goes far out, more substeps may lead nowhere
 def _asked(policy: MPCPolicy, states: Array, scale: Array) -> int:
     """The substeps that the plans from some states ask for, in increments of the log ``(n_states,)``."""
     mpc, model, now = policy.mpc, policy.mpc.model, _substeps(policy.mpc.model)
