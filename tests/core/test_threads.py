@@ -61,3 +61,17 @@ def test_what_a_job_raises_is_raised() -> None:
 
     with pytest.raises(ValueError, match="of the job"):
         side_by_side([lambda: 1, broken])
+
+
+def test_whoever_asks_takes_part() -> None:
+    """Were it to wait, the kernel would find one core free for two threads."""
+    both = threading.Barrier(2, timeout=30.0)
+
+    def job() -> int:
+        both.wait()
+        return threading.get_ident()
+
+    done = side_by_side([job] * 4, workers=2)
+    assert threading.get_ident() in done
+    assert len(set(done)) == 2
+    assert set(side_by_side([threading.get_ident] * 3, workers=1)) == {threading.get_ident()}

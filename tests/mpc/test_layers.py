@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from mpcoffline.mpc.expressions import expanded
 from mpcoffline.mpc.integrators import rk4_expression
 from mpcoffline.mpc.layer_steps import Dense, Map, Node, Scalars
-from mpcoffline.mpc.layers import Layered, layered
+from mpcoffline.mpc.layers import Layered, layered, may_be_layered
 
 
 def silu(x: ca.SX) -> ca.SX:
@@ -143,3 +144,20 @@ def test_any_mixture_of_sums_and_operations_is_itself(seed: int) -> None:
     if structure is not None:
         point = rng.normal(size=6)
         np.testing.assert_allclose(replayed(structure, [point]), function(point).full()[:, 0], rtol=1e-9, atol=1e-9)
+
+
+def test_derivatives_of_a_plant_are_soon_seen_to_have_no_layers() -> None:
+    """Ten tanks in a row: thousands of operations with a dozen numbers; a network of few weights has more of these."""
+    x, p = ca.SX.sym("x", 10), ca.SX.sym("p", 10)
+
+    def ode(x: ca.SX) -> ca.SX:
+        flow = p * ca.sqrt(1.0 + x**2)
+        return ca.vertcat(0, flow[:-1]) - flow + 0.1 * ca.sin(x)
+
+    reached = rk4_expression(ode, rk4_expression(ode, x, 0.05), 0.05)
+    slope = ca.vec(ca.densify(ca.jacobian(reached, x)))
+    plant = expanded(ca.Function("plant", [x, p], [slope]))
+    assert plant.n_instructions() > 2000
+    assert not may_be_layered(plant)
+    assert layered(plant) is None
+    assert may_be_layered(expanded(ca.Function("net", [x], [network(x, (8, 1), ca.tanh)])))
