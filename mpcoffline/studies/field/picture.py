@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS, _DPI = 3, 170
+_MARGIN = 0.05  # of the height, below the least
 _BEYOND = 6.0  # costs above so many times the best are drawn at the edge
 
 #: Text, axes, grid of a page.
@@ -133,7 +134,8 @@ def _panel(axes: Axes, results: Results, arena: str, tone: str) -> None:
     axes.set_xlim(0.6 * min(sizes), 1.7 * max(sizes))
     axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
     axes.minorticks_off()
-    axes.set_ylim(top=top)
+    lowest = axes.dataLim.ymin
+    axes.set_ylim(lowest - _MARGIN * (top - lowest), top)  # autoscaling does not know of the top
     axes.set_title(arena.replace("_", " "), loc="left", fontweight="bold")
 
 
