@@ -6,8 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.shards import Change as RowChange, ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
-from mpcoffline.estimation import Identification, Residual, fit_residual
+from mpcoffline.estimation import Identification
 from mpcoffline.mpc import MPC
 
 from .limit_costs import LimitCosts
@@ -26,8 +25,7 @@ from .value.function import ValueFunction
 #: Share of the variance of costs that rounding may leave open.
 ROUNDING = 1e-6
 
-_MISSED = 0.01  # of an increment, above which a residual is looked for
-
+T = TypeVar("T")
 Arrays = dict[str, NDArray[Any]]
 Metrics = dict[str, float]
 
@@ -197,19 +195,12 @@ class Known:
         shards = None if self.shards is None else self.shards.mapped(change)
         return replace(self, table=change(self.table), shards=shards)
 
-    @cached_property
-    def residual(self) -> Residual | None:
-        """What a network learns of what the identified model misses, found once; None where it misses next to nothing.
-
-        None, too, where no model is learned, or one that has a residual already.
-        """
-        from .known_cost import as_logged  # which is made of stages
-
-        learned = "model" in self.groups and self.residual_share is None
-        if not learned or self.found is None or self.found.error_after < _MISSED:
-            return None
-        identified = self.mpc.replace(model=self.found.model)
-        return fit_residual(identified, as_logged(identified, self.table, self.cost), self.seed)
+    def once(self, name: str, find: Callable[[], T]) -> T:
+        """What is found from all this, by name: found when it is first asked for, and kept."""
+        kept: dict[str, T] = self.__dict__.setdefault("_kept", {})
+        if name not in kept:
+            kept[name] = find()
+        return kept[name]
 
     @property
     def constant_value(self) -> ValueFunction:

@@ -6,13 +6,16 @@ import dataclasses
 import logging
 from collections.abc import Mapping
 
-from mpcoffline.estimation import with_residual
+from mpcoffline.estimation import Residual, fit_residual, with_residual
+from mpcoffline.learning.known_cost import as_logged
 from mpcoffline.learning.stages import Known
 from mpcoffline.mpc import MPC
 
 from .stages import TerminalConfig, in_units_of, repriced_as_logged, with_terminal_cost
 
 _log = logging.getLogger(__name__)
+
+_MISSED = 0.01  # of an increment, above which a residual is looked for
 
 
 def candidates(
@@ -78,9 +81,16 @@ def with_learned_residual(known: Known, mpcs: Mapping[str, MPC]) -> dict[str, MP
         known: What is known at the end of the fit.
         mpcs: The candidates by name.
     """
-    found, residual = known.found, known.residual
-    if found is None or residual is None:
+    found, learned = known.found, "model" in known.groups and known.residual_share is None
+    if not learned or found is None or found.error_after < _MISSED:
         return {}
-    _log.info("%s", residual)
+    identified = known.mpc.replace(model=found.model)
+
+    def fitted() -> Residual:
+        residual = fit_residual(identified, as_logged(identified, known.table, known.cost), known.seed)
+        _log.info("%s", residual)
+        return residual
+
+    residual = known.once("residual", fitted)
     alike = {name: mpc.replace(model=found.model) for name, mpc in mpcs.items() if mpc.layout == known.mpc.layout}
     return {f"{name}, residual": with_residual(mpc, residual) for name, mpc in alike.items()} if residual.taken else {}
