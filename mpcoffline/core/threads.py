@@ -33,6 +33,9 @@ def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) ->
     Args:
         jobs: What to do; whoever is free takes the next one.
         workers: How many threads; as many as torch has by default.
+
+    Returns:
+        One a job. What a job raises is raised, once all threads have come to their end.
     """
     if workers is None:
         import torch

@@ -58,8 +58,8 @@ def fine_enough(
     states, scale = _states(rows, known.seed), known.found.scale
     while True:
         free = [ready(mpc) for mpc in mpcs.values() if _is_free(mpc.model) and mpc.nx == states.shape[1]]
-        now, policies = max((_substeps(mpc.model) for mpc in free), default=_FINEST), _policies(free)
-        if now >= _FINEST or are_slow(policies):
+        now = max((_substeps(mpc.model) for mpc in free), default=_FINEST)
+        if now >= _FINEST or are_slow(policies := _policies(free)):
             break
         needed = min(_FINEST, max(_asked(policy, states, scale) for policy in policies))
         if needed <= now:
@@ -79,13 +79,11 @@ def _states(rows: TransitionTable, seed: int) -> Array:
 
 
 def _policies(mpcs: list[MPC]) -> list[MPCPolicy]:
+    """Their policies, whose solvers are compiled side by side."""
     threads = torch.get_num_threads()
     with Ahead(threads if threads > 1 else 0) as ahead:
         ahead.start(mpcs)
-        policies = [quick_policy(mpc) for mpc in mpcs]
-        for policy in policies:
-            _ = policy.solver
-    return policies
+        return [quick_policy(mpc) for mpc in mpcs]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # where a plan goes far out, more substeps may lead nowhere

@@ -80,7 +80,8 @@ class OfflineMPCLearner:
         seed: Seeds weights and minibatches. Same seed, data and machine: same theta, bit for bit.
         candidate: Which of the ``candidates`` is handed out. ``"auto"`` tries them on models of the log and takes
             the best, MPC_1 where none is better; that solves MPCs, learning does not. ``"full"``, or another name,
-            takes that one and tries nothing. The paper's preset has no others than the whole fit.
+            takes that one and tries nothing; under ``integrator="auto"`` it is then as fine as the log asks for, not as
+            its plans do. The paper's preset has no others than the whole fit.
         polish: Whether weights of the best candidate are moved, too, by what closed loops on models of the log cost
             (``mpcoffline.simulation.polishing``); needs ``candidate="auto"`` and ``pip install "mpcoffline[polish]"``.
             ``learner.candidates.effort`` says what that gained in its time, and the regressions in theirs.

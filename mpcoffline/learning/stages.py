@@ -196,7 +196,12 @@ class Known:
         return replace(self, table=change(self.table), shards=shards)
 
     def once(self, name: str, find: Callable[[], T]) -> T:
-        """What is found from all this, by name: found when it is first asked for, and kept."""
+        """What is found from this alone, when it is first asked for; kept with it, not with what replaces it.
+
+        Args:
+            name: The same for the same thing.
+            find: Finds it.
+        """
         kept: dict[str, T] = self.__dict__.setdefault("_kept", {})
         if name not in kept:
             kept[name] = find()

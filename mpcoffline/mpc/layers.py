@@ -45,10 +45,14 @@ class Layered:
 
 
 def may_be_layered(flat: ca.Function) -> bool:
-    """Whether an SX function has as many different numbers as the sparsest matrix of a layer, which is soon counted.
+    """Whether an SX function has as many different numbers as the sparsest matrix of a layer has entries.
 
-    Derivatives of a plant's model have thousands of operations and a dozen numbers; whether they have layers takes a
-    tenth of a second to find out.
+    That is soon counted: derivatives of a plant's model have thousands of operations and a dozen numbers, and whether
+    they have layers takes a tenth of a second to find out. A guess for who only wants to be fast: weights of three
+    values make layers, too, which :func:`layered` finds.
+
+    Args:
+        flat: An SX function.
     """
     found: set[float] = set()
     for k in range(flat.n_instructions()):
@@ -62,16 +66,12 @@ def may_be_layered(flat: ca.Function) -> bool:
 def layered(function: ca.Function) -> Layered | None:
     """The layers of a function's first output, or None if it has none.
 
-    A layer's matrix holds at least 64 numbers, which are constants and not the same few again and again; weights that
-    are parameters stay scalar arithmetic.
+    A layer's matrix holds at least 64 numbers, which are constants; weights that are parameters stay scalar arithmetic.
 
     Raises:
         InvalidArgumentError: If CasADi cannot expand the function to SX.
     """
-    flat = expanded(function)
-    if not may_be_layered(flat):
-        return None
-    nodes, outputs = _results(instructions(flat))
+    nodes, outputs = _results(instructions(expanded(function)))
     blocks = _blocks(_sums(nodes, outputs))
     if not blocks:
         return None

@@ -161,3 +161,13 @@ def test_derivatives_of_a_plant_are_soon_seen_to_have_no_layers() -> None:
     assert not may_be_layered(plant)
     assert layered(plant) is None
     assert may_be_layered(expanded(ca.Function("net", [x], [network(x, (8, 1), ca.tanh)])))
+
+
+def test_weights_of_three_values_are_layers_too() -> None:
+    """Quantised ones: there is no telling by how many different numbers there are."""
+    x, weights = ca.SX.sym("x", 16), np.random.default_rng(0).choice([-0.7, 0.3, 0.7], size=(16, 16))
+    net = ca.Function("net", [x], [ca.tanh(weights @ ca.tanh(weights @ x))])
+    assert not may_be_layered(expanded(net))
+    structure = layered(net)
+    assert structure is not None
+    assert sum(isinstance(step, Dense) for step in structure.steps) == 2

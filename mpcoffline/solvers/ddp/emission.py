@@ -48,7 +48,7 @@ _FORMATS = {
 _LONGEST = 2500
 _PIECE = 500
 _LARGEST_POWER = 4 * 6  # in quarters
-_LEAST = 1e-290  # of what vd_rsqrt takes
+_LEAST, _MOST = 1e-290, 1e290  # of what vd_rsqrt takes
 
 
 def emit(name: str, inputs: list[ca.SX], output: ca.SX, attribute: str = "") -> str:
@@ -157,8 +157,8 @@ class _Statements:
         return self._read[k][self._program[k].sources[which]]
 
     def _is_root(self, k: int) -> bool:
-        """Whether it is the root of a value that is no less than a normal number."""
-        return self._program[k].op == ca.OP_SQRT and self._floors[self._operand(k)] > _LEAST
+        """Whether it is the root of a value that is no less than a normal number, which is none too large either."""
+        return self._program[k].op == ca.OP_SQRT and _LEAST < self._floors[self._operand(k)] < _MOST
 
     def _rooted_half(self, k: int) -> int | None:
         """The root, of twice such a root: CasADi's derivative of a root divides by that."""

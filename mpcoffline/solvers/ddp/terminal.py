@@ -98,6 +98,7 @@ class _StandIn:
         self.z = ca.SX()  # what the network sees, once it was asked
 
     def terminal_expression(self, x: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
+        """As of a cost."""
         self.z = self._cost.standardised(x, p)
         return self._cost.of_output(self._output, x, p)
 

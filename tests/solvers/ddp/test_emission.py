@@ -18,18 +18,13 @@ from mpcoffline.solvers.ddp.emission import emit
 POWERS = (0.25, 0.5, 0.75, 1.25, 1.5, 2.75, 3.0, 5.0, 6.0, -0.25, -0.5, -0.75, -1.0, -1.75, -3.0, 0.8, 7.0, 1.0 / 3.0)
 
 
-@pytest.mark.parametrize("power", POWERS)
-def test_a_plan_follows_a_model_with_powers(power: float) -> None:
-    """The states of a plan are those that CasADi's function reaches, to rounding."""
-
-    def step(x: Any, u: Any, p: Any) -> Any:
-        return ca.vertcat(0.9 * x[0] + 0.05 * (1.0 + x[1] ** 2) ** power + 0.1 * u[0], 0.8 * x[1] + 0.1 * u[0])
-
+def assert_plans_follow(step: Any, horizon: int) -> None:
+    """The states of plans are those that CasADi's function reaches, to rounding."""
     mpc = MPC(
         Model(step, 2, 1, 0.1, discrete=True),
         QuadraticCost(np.eye(2), np.eye(1)),
         QuadraticCost(np.eye(2)),
-        horizon=10,
+        horizon=horizon,
         discount=1.0,
         action_low=[-1.0],
         action_high=[1.0],
@@ -38,6 +33,14 @@ def test_a_plan_follows_a_model_with_powers(power: float) -> None:
     for x, u in zip(plan.x, plan.u, strict=True):
         reached = mpc.dynamics_function(x[:-1].T, u.T, mpc.theta).full().T
         np.testing.assert_allclose(x[1:], reached, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("power", POWERS)
+def test_a_plan_follows_a_model_with_powers(power: float) -> None:
+    def step(x: Any, u: Any, p: Any) -> Any:
+        return ca.vertcat(0.9 * x[0] + 0.05 * (1.0 + x[1] ** 2) ** power + 0.1 * u[0], 0.8 * x[1] + 0.1 * u[0])
+
+    assert_plans_follow(step, horizon=10)
 
 
 @pytest.mark.parametrize(("power", "called"), [(0.75, False), (-2.5, False), (3.0, False), (0.8, True), (7.25, True)])
@@ -74,7 +77,7 @@ def test_roots_of_what_may_not_be_positive_are_divided_by(of: Any) -> None:
 
 
 def test_reciprocals_cross_the_pieces_of_a_long_function() -> None:
-    """A plan through a thousand neurons, each divided by early and late: states are those that CasADi reaches."""
+    """Of 400 neurons and 200 roots, divided by early and late."""
 
     def step(x: Any, u: Any, p: Any) -> Any:
         signals = [net(0.01 * k + (1.0 + 0.001 * k) * x[0]) for k in range(400)]
@@ -82,19 +85,7 @@ def test_reciprocals_cross_the_pieces_of_a_long_function() -> None:
         late = sum(signals[::-1]) + sum(1.0 / root for root in roots) + 1e-3 * sum(roots)
         return ca.vertcat(0.9 * x[0] + 1e-3 * late / (3.0 + x[1] ** 2), 0.8 * x[1] + 0.1 * u[0] / (3.0 + x[1] ** 2))
 
-    mpc = MPC(
-        Model(step, 2, 1, 0.1, discrete=True),
-        QuadraticCost(np.eye(2), np.eye(1)),
-        QuadraticCost(np.eye(2)),
-        horizon=3,
-        discount=1.0,
-        action_low=[-1.0],
-        action_high=[1.0],
-    )
-    plan = make_solver(mpc, "ddp").solve(np.array([[0.5, 0.3], [-0.2, 0.9]])).plan
-    for x, u in zip(plan.x, plan.u, strict=True):
-        reached = mpc.dynamics_function(x[:-1].T, u.T, mpc.theta).full().T
-        np.testing.assert_allclose(x[1:], reached, rtol=1e-13, atol=1e-13)
+    assert_plans_follow(step, horizon=3)
 
 
 def test_reciprocal_roots_are_exact_to_rounding() -> None:
