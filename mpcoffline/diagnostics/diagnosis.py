@@ -23,8 +23,9 @@ from mpcoffline.learning import ValueFunction
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.behaviour import Agreement, Behaviour, agreement
-from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
+from mpcoffline.simulation.choice import FIRST
 from mpcoffline.simulation.episodes import Controller, Episodes
+from mpcoffline.simulation.quick import are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Surroundings, Trials
 

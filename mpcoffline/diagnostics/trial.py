@@ -20,8 +20,9 @@ from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.behaviour import Behaviour, agreement, stretches
-from mpcoffline.simulation.choice import FIRST, are_slow, quick_policy
+from mpcoffline.simulation.choice import FIRST
 from mpcoffline.simulation.episodes import Controller
+from mpcoffline.simulation.quick import are_slow, quick_policy
 from mpcoffline.simulation.starts import cheapest_step, returns_along, signals_along
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Surroundings

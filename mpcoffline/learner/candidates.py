@@ -19,8 +19,9 @@ from mpcoffline.estimation import Sensors
 from mpcoffline.learning import Known
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation.back_offs import BackOffs, backed_off
-from mpcoffline.simulation.choice import FIRST, are_slow, choose, quick_policy, various_first
+from mpcoffline.simulation.choice import FIRST, choose, various_first
 from mpcoffline.simulation.polishing import Kept, polished
+from mpcoffline.simulation.quick import are_slow, quick_policy
 from mpcoffline.simulation.surroundings import surroundings_of
 from mpcoffline.simulation.trials import Trials
 from mpcoffline.solvers.ddp import Ahead

@@ -18,7 +18,7 @@ from mpcoffline.mpc import MPC
 from mpcoffline.mpc.integrators import Scheme
 from mpcoffline.mpc.model import Model
 from mpcoffline.mpc.substeps import Flow, choice_on
-from mpcoffline.simulation.choice import are_slow, quick_policy
+from mpcoffline.simulation.quick import are_slow, quick_policy
 from mpcoffline.solvers.ddp import Ahead
 
 logger = logging.getLogger(__name__)

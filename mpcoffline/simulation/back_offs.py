@@ -14,8 +14,8 @@ from mpcoffline.core.errors import FileFormatError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC, Constraint, StateBounds
 
-from .choice import quick_policy
 from .episodes import Episodes
+from .quick import quick_policy
 from .trials import Surroundings
 from .violations import TRIFLE, LimitFunction, limit_functions, moved
 

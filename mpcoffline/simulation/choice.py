@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Self
 
 import numpy as np
-import torch
 
-from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.executors import Executor, Serial
 from mpcoffline.core.parallel import chosen, n_cpus
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers import SOLVERS, CompilerError
 
 from .episodes import Controller, Episodes
+from .quick import quick_policy
 from .trials import Surroundings, Trials
 
 FIRST = "MPC_1"
-_SLOW = 10.0  # times as fast as ipopt
 _ROUNDS = (1 / 8, 1 / 3, 5 / 8)  # of the usual starts until the end of each; what is left judges
 _CLEAR = 2.0  # standard errors
 _TRIFLE = 0.01  # of the gain over MPC_1: what is better by less is no better
 _TOGETHER = 4  # MPCs whose closed loops are stepped together: much faster, and something is told in between
-_RETRIED = 0.1  # of the solves
 _JUDGED = 3  # of the best at most, one after the other
-_NEAR, _ITERATIONS = 1e-8, 60  # tolerance and iterations of simulated solves; a plant's own are nearer to the minimum
 _VARIED = (3, 1)  # of so many of the best, variants are tried after each of the first rounds
 _STAY = (math.inf, 6, 4)  # so many at most after each round, and the preferred one
 _LABOUR = 4.0  # times the solver's iterations of the best one, for nothing
@@ -221,32 +214,6 @@ class _Acting:
             if name not in self._policies:
                 self._policies[name] = self._around.seeing(quick_policy(mpc))
         return self._around.act([self._policies[name] for name in job.mpcs], job.starts)
-
-
-def are_slow(policies: Iterable[MPCPolicy]) -> bool:
-    """Whether one of them has a slow solver, as ipopt."""
-    return min(policy.solver.relative_speed for policy in policies) < _SLOW
-
-
-def quick_policy(mpc: MPC) -> MPCPolicy:
-    """A policy whose solver is fast in batches with active bounds, too: ``"ddp"`` where it takes the problem.
-
-    It takes as many threads as torch does, which change no digit. Without limits its solves end within 1e-8 of the
-    cost, or after 60 iterations: where Gauss-Newton creeps, as on learned residuals, the rest is half of the time.
-    Where plans have several minima, as in swing-ups, another may be found than on the plant. Few are retried: an MPC of
-    which many fail is no good one. What fails is counted, and told by those who ask; it is no warning, since nothing
-    real moves.
-    """
-    if "ddp" in SOLVERS and not SOLVERS["ddp"].refuses(mpc):
-        nearness: dict[str, Any] = (
-            {"tolerance": _NEAR, "max_iterations": _ITERATIONS} if mpc.constraints is None else {}
-        )
-        policy = MPCPolicy(mpc, "ddp", n_threads=torch.get_num_threads(), **nearness)
-        policy.retry_at_most(_RETRIED, logging.INFO)
-        with contextlib.suppress(CompilerError):
-            _ = policy.solver
-            return policy
-    return MPCPolicy(mpc)
 
 
 def _still_good(trials: Trials, names: list[str], end: int, preferred: str, labour: Mapping[str, float]) -> list[str]:

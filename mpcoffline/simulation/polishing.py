@@ -16,8 +16,8 @@ from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 
-from .choice import quick_policy
 from .episodes import Episodes
+from .quick import quick_policy
 from .trials import Surroundings
 
 _EVALUATIONS, _TOGETHER = 80, 8

@@ -13,7 +13,7 @@ from mpcoffline.estimation import identify
 from mpcoffline.learner.fineness import fine_enough
 from mpcoffline.learning import Known
 from mpcoffline.mpc.integrators import Scheme
-from mpcoffline.simulation.choice import quick_policy
+from mpcoffline.simulation.quick import quick_policy
 
 DT = 0.1
 

@@ -15,9 +15,9 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC, Constraint, Penalty, QuadraticCost, StateBounds
 from mpcoffline.simulation.back_offs import BackOffs, backed_off
-from mpcoffline.simulation.choice import quick_policy
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
+from mpcoffline.simulation.quick import quick_policy
 from mpcoffline.simulation.trials import Surroundings
 
 Array = NDArray[np.float64]

@@ -13,9 +13,10 @@ from mpcoffline.estimation.identification import identify_one_step
 from mpcoffline.mpc import MPC, QuadraticCost
 from mpcoffline.plants import nominal_mpc
 from mpcoffline.simulation import choice
-from mpcoffline.simulation.choice import FIRST, choose, quick_policy
+from mpcoffline.simulation.choice import FIRST, choose
 from mpcoffline.simulation.logged_cost import LoggedCost
 from mpcoffline.simulation.models import LogModels
+from mpcoffline.simulation.quick import quick_policy
 from mpcoffline.simulation.trials import Surroundings, Trials
 
 LOG = episodes()

@@ -29,7 +29,7 @@ from .limited import Limited, address, better
 from .rounding import Rounding
 
 # By the kernel's codes.
-_STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE, Status.INFEASIBLE)
+STATUS = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE, Status.INFEASIBLE)
 _LANES = 8
 _ITERATIONS, _LIMITED_ITERATIONS = 200, 500
 
@@ -201,7 +201,7 @@ class DDPSolver(Solver):
             "predicted_decrease": result["predicted"],
             "all_starts": result.get("all_starts", warm_start is None),
         }
-        ended = [_STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
+        ended = [STATUS[code] for code in status.tolist()]  # the first one only where all numbers are finite
         value = result["J"]
         if theta is not self._theta:
             value = value + self._constant(theta.T).full()[0]
@@ -263,7 +263,7 @@ class DDPSolver(Solver):
         if not np.count_nonzero(result["status"]):
             return result
         # A plan of a problem that could not be solved was the best from all starts; what is told again, is believed.
-        believed = self._was_lost(plan) & (result["status"] == _STATUS.index(Status.INFEASIBLE))
+        believed = self._was_lost(plan) & (result["status"] == STATUS.index(Status.INFEASIBLE))
         lost = known & (result["status"] > 1) & ~believed
         result["all_starts"] = ~known | lost | believed
         if np.count_nonzero(lost):
