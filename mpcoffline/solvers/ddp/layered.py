@@ -30,7 +30,8 @@ class _Run:
         targets: Results that others read, or whose derivatives are computed one by one.
         values: Expressions of them, in the symbols of ``sources``.
         sources: The symbols of other steps' results, by number.
-        edges: Numbers of target and source, a derivative each.
+        edges: Numbers of target and source, a derivative each; first those by states and inputs themselves.
+        n_by_states: How many these are.
         slopes: These derivatives.
     """
 
@@ -38,6 +39,7 @@ class _Run:
     values: ca.SX
     sources: dict[int, ca.SX]
     edges: list[tuple[int, int]]
+    n_by_states: int
     slopes: ca.SX
 
 
@@ -63,11 +65,12 @@ class LayeredCode:
         self.n_scalars: int = structure.n_scalars
         self._steps, self._outputs, self._nodes = structure.steps, structure.outputs, structure.nodes
         self._theta = theta
-        self._states = dict(_states(structure, nx))
+        self._states, self._first = dict(_states(structure, nx)), nx + nu
         exported = self._exported()
         runs = {k: self._run(step.nodes, exported) for k, step in enumerate(self._steps) if isinstance(step, Scalars)}
         self._runs = {k: run for k, run in runs.items() if run.targets}
-        self._slots, self._size = self._allocated(nx + nu)
+        self._slots, self._size = self._allocated(self._first)
+        self._constant = self._constant_slopes()
         v = ca.SX.sym("v", self._size)
         self.functions: dict[str, tuple[ca.SX, ca.SX]] = {}
         for k, run in self._runs.items():
@@ -112,6 +115,19 @@ class LayeredCode:
             free = _merged([*free, *((start, n) for until, start, n in busy if until <= i)])
             busy = [entry for entry in busy if entry[0] > i]
         return slots, size
+
+    def _constant_slopes(self) -> dict[int, Array]:
+        """Results whose derivatives by states and inputs are numbers, and these ``(nx + nu,)``: standardised ones."""
+        found = dict(zip(self._states, np.eye(self._first)[list(self._states.values())], strict=True))
+        for run in self._runs.values():
+            rows, varying = {k: np.zeros(self._first) for k in run.targets}, set[int]()
+            for (k, source), slope in zip(run.edges, ca.vertsplit(run.slopes), strict=True):
+                if source in found and slope.is_constant():
+                    rows[k] += float(slope) * found[source]
+                else:
+                    varying.add(k)
+            found |= {k: row for k, row in rows.items() if k not in varying}
+        return found
 
     def _known(self, k: int) -> ca.SX | None:
         """A result that needs no slot where scalar operations read it: a constant or a parameter."""
@@ -163,9 +179,11 @@ class LayeredCode:
         number = {at: k for k, at in place.items()}
         targets = [k for k in own if k in exported or graph.into[place[k]]]
         edges = [(k, number[source], slope) for k in targets for source, slope in graph.into[place[k]].items()]
+        edges.sort(key=lambda edge: edge[1] not in self._states)
+        n_by_states = sum(source in self._states for _, source, _ in edges)
         values = ca.vertcat(*(graph.values[place[k]] for k in targets))
         slopes = ca.vertcat(*(slope for *_, slope in edges))
-        return _Run(targets, values, sources, [(k, source) for k, source, _ in edges], slopes)
+        return _Run(targets, values, sources, [(k, source) for k, source, _ in edges], n_by_states, slopes)
 
     def maps(self) -> list[str]:
         """The C functions of the layers' maps: of a source and constants the results, and their derivatives."""
@@ -227,7 +245,11 @@ class LayeredCode:
             source = slope_source = "in"
             lines = [f"vd in[{columns}{' * NZ' if slopes else ''}];", f"layer_gather({at}, {columns}, v, in);"]
         lines.append(f"layer_values({matrix}, {bias}, {shape}, {source}, v + {to});")
-        if slopes:
+        if slopes and self._constant.keys() >= set(step.sources):
+            by_states = step.matrix @ np.stack([self._constant[k] for k in step.sources])
+            padded = np.pad(by_states, ((0, padding), (0, 0)))
+            lines.append(f"layer_constants({self._numbers(padded.ravel())}, {rows + padding}, d + {to} * NZ);")
+        elif slopes:
             lines += [f"layer_gather_slopes({at}, {columns}, d, in);"] if at else []
             lines.append(f"layer_slopes({matrix}, {shape}, {slope_source}, d + {to} * NZ);")
         return ["{", *(f"    {line}" for line in lines), "}"]
@@ -255,11 +277,16 @@ class LayeredCode:
         lines = [f"vd g[{n + n_edges}];", f"run{k}_slopes(v, p, g);"]
         lines.append(f"for (int i = 0; i < {n}; ++i) v[{to} + i] = g[i];")
         lines.append(f"for (int i = {to} * NZ; i < {to + n} * NZ; ++i) d[i] = V(0.0);")
-        if n_edges:
-            to_slots, from_slots = ([self._slots[o] for o in side] for side in zip(*run.edges, strict=True))
+        if run.n_by_states:
+            by_states = run.edges[: run.n_by_states]
+            places = self._integers([self._slots[k] * self._first + self._slots[o] for k, o in by_states])
+            lines.append(f"for (int e = 0; e < {run.n_by_states}; ++e) d[{places}[e]] += g[{n} + e];")
+        if others := run.edges[run.n_by_states :]:
+            to_slots, from_slots = ([self._slots[o] for o in side] for side in zip(*others, strict=True))
             source, target = self._integers(from_slots), self._integers(to_slots)
-            lines.append(f"for (int e = 0; e < {n_edges}; ++e)")
-            lines.append(f"    layer_added(g[{n} + e], d + {source}[e] * NZ, d + {target}[e] * NZ);")
+            lines.append(f"for (int e = 0; e < {len(others)}; ++e)")
+            first = n + run.n_by_states
+            lines.append(f"    layer_added(g[{first} + e], d + {source}[e] * NZ, d + {target}[e] * NZ);")
         return ["{", *(f"    {line}" for line in lines), "}"]
 
     def _span(self, numbers: list[int]) -> int | None:

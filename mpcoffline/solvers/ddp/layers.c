@@ -35,6 +35,11 @@ static void layer_slopes(const double *W, int rows, int columns, const vd *in, v
     }
 }
 
+/* out = W, of derivatives by what a layer's sources are: states and inputs themselves */
+static inline void layer_constants(const double *W, int rows, vd *out) {
+    for (int i = 0; i < rows * NZ; ++i) out[i] = V(W[i]);
+}
+
 static inline void layer_gather(const int *index, int n, const vd *v, vd *out) {
     for (int i = 0; i < n; ++i) out[i] = v[index[i]];
 }
