@@ -23,6 +23,19 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
+def at_leisure(jobs: Sequence[Callable[[], T]]) -> Iterator[T]:
+    """What some jobs give, one after the other, of which the later ones may not be asked for.
+
+    With one thread (of torch), each is done when it is asked for; with several, :func:`side_by_side`.
+    """
+    import torch
+
+    if min(torch.get_num_threads(), len(jobs)) > 1:
+        yield from side_by_side(jobs)
+    else:
+        yield from (job() for job in jobs)
+
+
 def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) -> list[T]:
     """What some jobs give, in their order, done by several threads, of which the one that asks is one.
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from functools import partial
+from typing import Any, NamedTuple, Self
 
 import casadi as ca
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from mpcoffline.core.threads import at_leisure
 from mpcoffline.core.types import Array
 from mpcoffline.mpc.networks import random_layers
 
@@ -24,10 +26,9 @@ _PATIENCE = 12  # steps without a smaller error on the data held out
 _NARROW = 0.1  # of the size that random_layers gives to the output layer: the first guess is next to nothing
 
 
-Layers = tuple[list[Array], list[Array]]  # weights and biases
+Layers = list[Array]  # matrices [A, b], next to each other: signals are followed by a 1
 Rows = tuple[Array, Array, Array]  # inputs, unit of each output, targets
 Single = NDArray[np.float32]
-Places = NDArray[np.intp]
 
 
 class Effort(NamedTuple):
@@ -97,7 +98,8 @@ class SmallNetwork:
     def __call__(self, data: Array) -> Array:
         """The outputs ``(rows, m)`` at inputs ``(rows, n)``."""
         z, gate = self.gate.standardised(data)
-        return np.asarray(gate[:, None] * self.limit * _signals(self.weights, self.biases, z)[0][-1])
+        layers = [np.column_stack([A, b]) for A, b in zip(self.weights, self.biases, strict=True)]
+        return np.asarray(gate[:, None] * self.limit * _signals(layers, z)[0][-1])
 
     def expression(self, v: ca.SX) -> ca.SX:
         """The same for a symbol v ``(n, 1)``, ``(m, 1)``."""
@@ -139,14 +141,14 @@ def fit_small_network(
     def descended(decay: float) -> tuple[Layers, float]:
         return _descended(sizes, batches, held_out, decay * size, np.random.default_rng(seed), effort)
 
-    chosen = effort.decays[0]
-    best, error = descended(chosen)
-    for decay in effort.decays[1:]:
-        other, smaller = descended(decay)
+    # Which pulls are worth it is known behind the first ones; but a core that has nothing else to do may as well try.
+    tried = at_leisure([partial(descended, decay) for decay in effort.decays])
+    chosen, (best, error) = effort.decays[0], next(tried)
+    for decay, (other, smaller) in zip(effort.decays[1:], tried, strict=True):
         if not smaller < _WORTH * error:
             break
         best, error, chosen = other, smaller, decay
-    return SmallNetwork(gate, tuple(best[0]), tuple(best[1]), limit, chosen)
+    return SmallNetwork(gate, tuple(M[:, :-1] for M in best), tuple(M[:, -1] for M in best), limit, chosen)
 
 
 def _descended(
@@ -158,16 +160,15 @@ def _descended(
     effort: Effort,
 ) -> tuple[Layers, float]:
     """Weights and biases with the smallest error on the rows held out, and that error."""
-    weights, biases = random_layers(sizes, rng)
-    weights[-1], biases[-1] = _NARROW * weights[-1], 0.0 * biases[-1]
-    p = np.concatenate([part.ravel() for part in (*weights, *biases)])
-    shapes = [part.shape for part in (*weights, *biases)]
+    layers = [np.column_stack([A, b]) for A, b in zip(*random_layers(sizes, rng), strict=True)]
+    layers[-1] = np.column_stack([_NARROW * layers[-1][:, :-1], np.zeros(sizes[-1])])
+    p, shapes = np.concatenate([M.ravel() for M in layers]), [M.shape for M in layers]
     best, least_error, since = p, _error(_layers(p, shapes), *held_out), 0
     damping, least, most = _DAMPING
     for _ in range(effort.steps):
         rows = rng.permutation(len(data[0]))[: effort.rows]
         batch = data[0][rows], data[1][rows], data[2][rows]
-        curvature, slope, error = _normal_equations(_layers(p, shapes), *batch, len(p))
+        curvature, slope, error = _normal_equations(_layers(p, shapes), *batch)
         slope -= decay * p
         for _ in range(_ATTEMPTS):
             step = _solved(curvature, damping * (np.diag(curvature) + decay) + decay, slope)
@@ -191,89 +192,107 @@ def _solved(curvature: Array, diagonal: Array, slope: Array) -> Array | None:
     matrix = curvature.copy()
     np.fill_diagonal(matrix, np.diag(curvature) + diagonal)
     try:
-        factor = scipy.linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+        root = np.linalg.cholesky(matrix)  # scipy's holds the interpreter lock, and other members of an ensemble wait
     except np.linalg.LinAlgError:
         return None
-    return np.asarray(scipy.linalg.cho_solve(factor, slope, check_finite=False))
+    half = scipy.linalg.solve_triangular(root, slope, lower=True, check_finite=False)
+    return np.asarray(scipy.linalg.solve_triangular(root, half, lower=True, trans="T", check_finite=False))
 
 
 def _layers(flat: Array, shapes: list[tuple[int, ...]]) -> Layers:
-    """Weights and biases of a flat vector."""
+    """The matrices of a flat vector."""
     ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
-    parts = [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
-    return parts[: len(parts) // 2], parts[len(parts) // 2 :]
+    return [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
 
 
-def _signals(weights: list[Array] | tuple[Array, ...], biases: list[Array] | tuple[Array, ...], z: Array) -> Layers:
+def _signals(layers: Layers, z: Array) -> tuple[list[Array], list[Array]]:
     """The signals z, s(..), s(..), y, and the slopes of the three activations."""
     signals, slopes = [z], []
-    for A, b in zip(weights, biases, strict=True):
-        a = signals[-1] @ A.T + b
+    for M in layers:
+        a = signals[-1] @ M[:, :-1].T + M[:, -1]
         norm = 1.0 / np.sqrt(1.0 + a * a)
         signals.append(a * norm)
-        slopes.append(norm**3)
+        slopes.append(norm * norm * norm)  # a power takes ten times as long
     return signals, slopes
 
 
 def _error(layers: Layers, z: Array, unit: Array, targets: Array) -> float:
-    return float(np.sum((unit * _signals(*layers, z)[0][-1] - targets) ** 2) / len(z))
+    return float(np.sum((unit * _signals(layers, z)[0][-1] - targets) ** 2) / len(z))
 
 
-def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array, size: int) -> tuple[Array, Array, float]:
-    """J'J, J'(targets - y) and the squared error, per row.
+def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array) -> tuple[Array, Array, float]:
+    """J'J, on and below its diagonal, J'(targets - y), and the squared error, per row.
 
     A layer's part of a row of J is an outer product, of what back-propagation gives for an output o and the layer's
     input, ``d_o v'``. So nothing needs J: of two layers, with sums over outputs before those over rows::
 
         J_l'J_k = sum_rows (sum_o d_lo d_ko') x (v_l v_k')
+
+    The sum of the second layer is linear in the squared slopes of outputs, and those of the first one are products of
+    it with A_1. Where l = k both factors are symmetric, and a quarter of their entries is enough.
     """
-    weights, biases = layers
-    signals, slopes = _signals(weights, biases, z)
-    missed = targets - unit * signals[-1]
+    signals, slopes = _signals(layers, z)
     n, single = len(z), np.float32
-    last = (unit * slopes[2]).astype(single)
-    second = last[:, :, None] * weights[2].astype(single) * slopes[1].astype(single)[:, None, :]
-    first = (second @ weights[1].astype(single)) * slopes[0].astype(single)[:, None, :]
-    back, inputs = (first, second), [np.hstack([v, np.ones((n, 1))], dtype=single) for v in signals[:3]]
-    places = _places(weights, biases)
-    curvature, slope = np.zeros((size, size)), np.zeros(size)
-
-    def summed(d: Single, v: Single, w: Single) -> Single:
-        """``sum_rows d v w'``, (entries of d, of v, of w)."""
-        outer = (v[:, :, None] * w[:, None, :]).reshape(n, -1)
-        return (d.reshape(n, -1).T @ outer).reshape(-1, v.shape[1], w.shape[1])
-
-    def put(rows: Places, columns: Places, block: Single) -> None:
-        curvature[np.ix_(rows, columns)] = block
-        curvature[np.ix_(columns, rows)] = block.T
-
-    for i, k in ((0, 0), (0, 1), (1, 1)):
-        blocks = summed(back[i].transpose(0, 2, 1) @ back[k], inputs[i], inputs[k])
-        shape = back[i].shape[2], back[k].shape[2], *blocks.shape[1:]
-        block = blocks.reshape(shape).transpose(0, 2, 1, 3).reshape(places[i].size, places[k].size)
-        put(places[i].ravel(), places[k].ravel(), block)
-    own = summed(last**2, inputs[2], inputs[2])
-    across = [summed(last[:, :, None] * d, v, inputs[2]) for d, v in zip(back, inputs, strict=False)]
-    for o, mine in enumerate(places[2]):
-        put(mine, mine, own[o])
-        for theirs, blocks in zip(places, across, strict=False):
-            put(theirs.ravel(), mine, blocks.reshape(len(places[2]), theirs.size, len(mine))[o])
-    off = missed.astype(single)
-    for d, v, where in zip((*back, None), inputs, places, strict=True):
-        pulled = last * off if d is None else (off[:, None, :] @ d)[:, 0]
-        slope[where] = pulled.T @ v
-    return curvature / n, slope / n, float(np.sum(missed**2) / n)
+    missed, last = targets - unit * signals[-1], unit * slopes[2]
+    A_1, A_2, s_0, s_1 = (v.astype(single) for v in (layers[1][:, :-1], layers[2][:, :-1], slopes[0], slopes[1]))
+    v = [np.hstack([signal, np.ones((n, 1))], dtype=single) for signal in signals[:3]]
+    out: Single = last.astype(single)
+    second_second = (out**2 @ _pairs(A_2, A_2)).reshape(n, len(A_1), -1) * _outer(s_1, s_1)
+    half = (second_second.reshape(-1, len(A_1)) @ A_1).reshape(n, len(A_1), -1)
+    second_first, turned = half * s_0[:, None, :], np.ascontiguousarray(half.transpose(0, 2, 1))
+    first_first = (turned.reshape(-1, len(A_1)) @ A_1).reshape(n, s_0.shape[1], -1) * _outer(s_0, s_0)
+    second = out[:, :, None] * A_2 * s_1[:, None, :]
+    first = (second.reshape(-1, len(A_1)) @ A_1).reshape(n, -1, s_0.shape[1]) * s_0[:, None, :]
+    below = {
+        (0, 0): _symmetric_sums(first_first, v[0]),
+        (1, 0): _sums(second_first, v[1], v[0]),
+        (1, 1): _symmetric_sums(second_second, v[1]),
+        (2, 0): _sums(out[:, :, None] * first, v[2], v[0]),
+        (2, 1): _sums(out[:, :, None] * second, v[2], v[1]),
+    }
+    ends = np.cumsum([0, *(M.size for M in layers)])
+    parts = [slice(ends[k], ends[k + 1]) for k in range(3)]
+    curvature = np.zeros((ends[-1], ends[-1]))
+    for (i, k), block in below.items():
+        np.divide(block, n, out=curvature[parts[i], parts[k]])
+    for o, block in enumerate(_sums((out**2)[:, :, None], v[2], v[2]).reshape(out.shape[1], v[2].shape[1], -1)):
+        at = slice(ends[2] + o * len(block), ends[2] + (o + 1) * len(block))
+        np.divide(block, n, out=curvature[at, at])
+    pulled_2 = last * missed
+    pulled_1 = (pulled_2 @ layers[2][:, :-1]) * slopes[1]
+    pulled_0 = (pulled_1 @ layers[1][:, :-1]) * slopes[0]
+    slope = [(pulled.T @ signal).ravel() for pulled, signal in zip((pulled_0, pulled_1, pulled_2), v, strict=True)]
+    return curvature, np.concatenate(slope) / n, float(np.sum(missed**2) / n)
 
 
-def _places(weights: list[Array], biases: list[Array]) -> list[Places]:
-    """Where the entries of each layer's ``[A, b]`` are in the flat vector of all weights and biases."""
-    ends, sizes = np.cumsum([A.size for A in weights]), np.cumsum([b.size for b in biases])
-    return [
-        np.hstack(
-            [
-                np.arange(end - A.size, end).reshape(A.shape),
-                ends[-1] + np.arange(stop - b.size, stop)[:, None],
-            ]
-        )
-        for A, b, end, stop in zip(weights, biases, ends, sizes, strict=True)
-    ]
+def _outer(a: Single, b: Single) -> Single:
+    """Outer products of rows, ``(n, entries of a, of b)``."""
+    return np.asarray(a[:, :, None] * b[:, None, :])
+
+
+def _pairs(a: Single, b: Single) -> Single:
+    """The same, ``(n, entries of both)``."""
+    return _outer(a, b).reshape(len(a), -1)
+
+
+def _sums(d: NDArray[Any], v: Single, w: Single) -> Single:
+    """``sum_rows d_ab v_c w_e`` as a matrix of rows (a, c) and columns (b, e)."""
+    summed = d.reshape(len(d), -1).T @ _pairs(v, w)
+    shape = *d.shape[1:], v.shape[1], w.shape[1]
+    return np.asarray(summed.reshape(shape).transpose(0, 2, 1, 3).reshape(shape[0] * shape[2], -1))
+
+
+def _symmetric_sums(d: NDArray[Any], v: Single) -> Single:
+    """The same of symmetric d, and v twice: of the entries above the diagonals alone."""
+    (above_d, of_d), (above_v, of_v) = (_above(size) for size in (d.shape[1], v.shape[1]))
+    summed = d[:, above_d[0], above_d[1]].T @ (v[:, above_v[0]] * v[:, above_v[1]])
+    whole, size = summed[of_d][:, of_v], d.shape[1] * v.shape[1]
+    return np.asarray(whole.reshape(d.shape[1], d.shape[1], v.shape[1], -1).transpose(0, 2, 1, 3).reshape(size, size))
+
+
+def _above(size: int) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.intp]]:
+    """Indices of a matrix's upper triangle, and for each entry of the matrix which of them it is."""
+    above = np.triu_indices(size)
+    where = np.zeros((size, size), dtype=np.intp)
+    where[above] = where[above[1], above[0]] = np.arange(len(above[0]))
+    return above, where.ravel()

@@ -21,6 +21,7 @@ from mpcoffline.estimation import Identification, identify, smooth
 from mpcoffline.estimation.features import RandomFeatures, Ridge
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.coordinates import Coordinates, canonical, with_level
+from mpcoffline.mpc.row_twin import RowTwin
 from mpcoffline.mpc.scaling import Scaling
 
 from .normed_cost import normed_cost
@@ -300,18 +301,19 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int, reached: 
     _, logged, inputs, _ = _costs(mpc, few, reached)
     if not len(logged):  # every row ends an episode
         return None
-    s, a, size = inputs[:, : mpc.nx].T, inputs[:, mpc.nx :].T, float(logged.std())
+    s, a, size = inputs[:, : mpc.nx], inputs[:, mpc.nx :], float(logged.std())
     if not size > 0.0:
         return None
     x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
-    cost = mpc.stage_function(x, u, theta)
-    slopes = ca.Function("slopes", [x, u, theta], [ca.densify(ca.gradient(cost, theta))])
+    cost, free = mpc.stage_function(x, u, theta), np.flatnonzero(coordinates.mask).tolist()
+    slopes = RowTwin(ca.Function("slopes", [x, u, theta], [ca.densify(ca.gradient(cost, theta)[free])]))
+    costs = RowTwin(mpc.stage_function)
 
     def full(z: Array) -> Array:
         return np.asarray(coordinates.theta(torch.from_numpy(np.asarray(z))).numpy())
 
     def missed(theta: Array) -> Array:
-        return np.asarray(logged - mpc.stage_function(s, a, theta).full().ravel())
+        return np.asarray(logged - costs(s, a, theta)[:, 0])
 
     def residuals(z: Array) -> Array:
         """With the best constant for every z."""
@@ -321,7 +323,7 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int, reached: 
     def jacobian(z: Array) -> Array:
         values = full(z)
         change = np.where(coordinates.logarithmic, values[coordinates.mask], coordinates.scale)
-        rates = slopes(s, a, values).full()[coordinates.mask].T * change / size
+        rates = slopes(s, a, values) * change / size
         return np.asarray(np.nan_to_num(rates - rates.mean(axis=0)))
 
     low, high = np.minimum(coordinates.low, -1e-9), np.maximum(coordinates.high, 1e-9)

@@ -129,7 +129,7 @@ def test_a_model_without_a_residual_is_as_it_was() -> None:
 
 def test_the_normal_equations_are_those_of_casadis_derivatives() -> None:
     rng = np.random.default_rng(0)
-    shapes = [(4, 3), (5, 4), (2, 5), (4,), (5,), (2,)]
+    shapes = [(4, 4), (5, 5), (2, 6)]
     size = sum(int(np.prod(s)) for s in shapes)
     p, z, unit, targets = (
         rng.normal(size=size),
@@ -137,14 +137,14 @@ def test_the_normal_equations_are_those_of_casadis_derivatives() -> None:
         rng.uniform(1, 2, (6, 2)),
         rng.normal(size=(6, 2)),
     )
-    curvature, slope, error = _normal_equations(_layers(p, shapes), z, unit, targets, size)
+    curvature, slope, error = _normal_equations(_layers(p, shapes), z, unit, targets)
 
     def outputs(flat: Array) -> Array:
-        return np.asarray((unit * _signals(*_layers(flat, shapes), z)[0][-1]).ravel())
+        return np.asarray((unit * _signals(_layers(flat, shapes), z)[0][-1]).ravel())
 
     J = np.stack([(outputs(p + 1e-6 * e) - outputs(p - 1e-6 * e)) / 2e-6 for e in np.eye(size)], axis=1)
     missed = targets.ravel() - outputs(p)
-    np.testing.assert_allclose(curvature, J.T @ J / 6, atol=1e-4 * np.abs(J.T @ J).max())
+    np.testing.assert_allclose(np.tril(curvature), np.tril(J.T @ J) / 6, atol=1e-4 * np.abs(J.T @ J).max())
     np.testing.assert_allclose(slope, J.T @ missed / 6, atol=1e-4 * np.abs(J.T @ missed).max())
     assert error == pytest.approx(missed @ missed / 6)
 

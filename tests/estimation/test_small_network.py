@@ -17,21 +17,21 @@ def test_the_normal_equations_are_those_of_automatic_derivatives(sizes: tuple[in
     biases = [rng.standard_normal(b.shape) for b in biases]
     z, targets = rng.standard_normal((40, sizes[0])), rng.standard_normal((40, sizes[-1]))
     unit = rng.uniform(0.5, 2.0, targets.shape)
-    parts = [*weights, *biases]
-    flat = torch.from_numpy(np.concatenate([part.ravel() for part in parts]))
+    layers = [np.column_stack(layer) for layer in zip(weights, biases, strict=True)]
+    flat = torch.from_numpy(np.concatenate([layer.ravel() for layer in layers]))
 
     def outputs(p: torch.Tensor) -> torch.Tensor:
-        pieces = torch.split(p, [part.size for part in parts])
-        shaped = [piece.reshape(part.shape) for piece, part in zip(pieces, parts, strict=True)]
         v = torch.from_numpy(z)
-        for A, b in zip(shaped[:3], shaped[3:], strict=True):
-            a = v @ A.T + b
+        for piece, layer in zip(torch.split(p, [layer.size for layer in layers]), layers, strict=True):
+            M = piece.reshape(layer.shape)
+            a = v @ M[:, :-1].T + M[:, -1]
             v = a / torch.sqrt(1.0 + a * a)
         return (torch.from_numpy(unit) * v).ravel()
 
     J = torch.autograd.functional.jacobian(outputs, flat).numpy()
     missed = targets.ravel() - outputs(flat).numpy()
-    curvature, slope, error = _normal_equations((weights, biases), z, unit, targets, len(flat))
-    np.testing.assert_allclose(curvature, J.T @ J / len(z), rtol=0, atol=1e-6 * np.abs(J.T @ J / len(z)).max())
+    curvature, slope, error = _normal_equations(layers, z, unit, targets)
+    truth = J.T @ J / len(z)
+    np.testing.assert_allclose(np.tril(curvature), np.tril(truth), rtol=0, atol=1e-6 * np.abs(truth).max())
     np.testing.assert_allclose(slope, J.T @ missed / len(z), rtol=0, atol=1e-6 * np.abs(J.T @ missed / len(z)).max())
     assert error == pytest.approx(missed @ missed / len(z))
