@@ -9,7 +9,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
@@ -215,19 +214,22 @@ def candidates_of(
         UnknownIdError: If it was asked for a candidate that there is none of.
     """
     known, nominal, soft = run.known, learner.nominal_mpc, learner.softening
-    between = {} if learner.candidate == FULL else run.method.candidates(known)
+    ready = _as_it_is if soft is None else soft
     if learner.candidate == "auto":
         show, begun = partial(bars.show, "choosing on models of the log"), core_seconds()
-        if not between:
-            if learner.polish:
-                logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
-            return None
-        how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
-        how |= {"kept": kept, "learned_in": learned_in, "sensors": learner.sensors}
-        how["ready"] = ready = _as_it_is if soft is None else soft
-        known, between = fine_enough(known, between, table, ready)
-        variants = partial(run.method.variants, known)
-        return tried(nominal, known, {**between, **also}, table, variants, show, begun=begun, **how)
+        with Ahead() as ahead:
+            ahead.start([ready(known.mpc), ready(nominal)])  # most candidates' code is that of one of these two
+            between = run.method.candidates(known)
+            if not between:
+                if learner.polish:
+                    logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
+                return None
+            how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
+            how |= {"kept": kept, "learned_in": learned_in, "sensors": learner.sensors, "ready": ready}
+            known, between = fine_enough(known, between, table, ready)
+            variants = partial(run.method.variants, known)
+            return tried(nominal, known, {**between, **also}, table, variants, show, begun=begun, **how)
+    between = {} if learner.candidate == FULL else run.method.candidates(known)
     mpcs = {FIRST: nominal, **between, **also, FULL: known.mpc}
     for turn in (1, 0, 1):  # a variant, and one of a variant
         if learner.candidate not in mpcs:
@@ -276,10 +278,9 @@ def tried(
     mpcs = _different({name: ready(mpc) for name, mpc in {FIRST: nominal, **between, FULL: known.mpc}.items()})
     if known.found is None:
         raise InvalidArgumentError("candidates", expected="an identified model to try them on", actual="none")
-    threads = torch.get_num_threads()
-    with Ahead(threads if threads > 1 else 0) as ahead:  # one core has none to spare
+    with Ahead() as ahead:
         ahead.start(mpcs.values())
-        if threads > 1:  # which variants will be asked for is not known yet; but most of them are the same code
+        if ahead.works:  # which variants will be asked for is not known yet; but most of them are the same code
             ahead.start(variants({name: mpc for name, mpc in mpcs.items() if name != FIRST}, 0).values())
 
         def variants_ahead(good: Mapping[str, MPC], turn: int) -> Mapping[str, MPC]:

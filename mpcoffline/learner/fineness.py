@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.types import Array
@@ -80,8 +79,7 @@ def _states(rows: TransitionTable, seed: int) -> Array:
 
 def _policies(mpcs: list[MPC]) -> list[MPCPolicy]:
     """Their policies, whose solvers are compiled side by side."""
-    threads = torch.get_num_threads()
-    with Ahead(threads if threads > 1 else 0) as ahead:
+    with Ahead() as ahead:
         ahead.start(mpcs)
         return [quick_policy(mpc) for mpc in mpcs]
 

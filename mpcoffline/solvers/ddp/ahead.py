@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 
+import torch
+
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc import MPC
 
@@ -20,12 +22,21 @@ class Ahead:
     one core, another can compile. What is made is the same, and is found in the cache as any other.
 
     Args:
-        workers: How many compilers at a time; 0 compiles nothing ahead.
+        workers: How many compilers at a time; 0 compiles nothing ahead. By default as many as torch has threads, and
+            none where it has one: one core has none to spare.
     """
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int | None = None) -> None:
+        if workers is None:
+            threads = torch.get_num_threads()
+            workers = threads if threads > 1 else 0
         self._pool = ThreadPoolExecutor(workers) if workers > 0 else None
         self._begun: list[str] = []
+
+    @property
+    def works(self) -> bool:
+        """Whether anything is compiled ahead."""
+        return self._pool is not None
 
     def __enter__(self) -> Self:
         return self

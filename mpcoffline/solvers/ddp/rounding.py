@@ -44,11 +44,13 @@ class Rounding:
         make: Makes a solver of a problem.
     """
 
+    corners: list[Corner]
+
     def __init__(self, mpc: MPC, make: Callable[[MPC], _Kernel]) -> None:
         self._mpc = mpc
-        problems = [rounded_mpc(mpc, share) for share in SHARES]
-        self.corners: list[Corner] = problems[0][1]
-        self._solvers = [make(rounded) for rounded, _ in problems] if self.corners else []
+        first, self.corners = rounded_mpc(mpc, SHARES[0])
+        rounded = [first, *(rounded_mpc(mpc, share)[0] for share in SHARES[1:])] if self.corners else []
+        self._solvers = [make(each) for each in rounded]
         self._told = False
 
     def improve(
