@@ -20,7 +20,9 @@ from .starts import costs_before, initial_rows
 from .trials import Surroundings
 
 STARTS = 64
-_SPARE_CHOOSING, _SPARE = 40, 128
+_FEWEST = 24  # where each is dear
+_LABOUR = 1.28e8  # multiplications of one iteration of all solves from all starts on a model; 64 starts of most plants
+_SPARE_CHOOSING, _SPARE = 40, 128  # beside 64
 _MOST_STEPS = 400
 _MOST_MODELS, _CHOOSING_MODELS = 7, 4
 _FEW_STARTS, _FEW_STEPS, _FEW_MODELS = 4, 60, 3  # where it would take an hour else
@@ -52,8 +54,8 @@ def surroundings_of(
         are_slow: Says whether a controller's solver is slow (ipopt): then few starts, short episodes, and the best
             models only. It is asked when the models are there: solvers may be compiled meanwhile.
         choosing: Whether many controllers are tried: then on the four best models, whichever they are.
-        n_starts: Number of episodes on each model; by default 64, and others for where these decide nothing. They begin
-            where those of the log did; where it has fewer, in like states, too.
+        n_starts: Number of episodes on each model; by default 64, of large problems fewer (24 at least), and others for
+            where these decide nothing. They begin where those of the log did; where it has fewer, in like states, too.
         n_steps: Their length; by default that of the logged ones that no end cut short, 400 at most.
         seed: Of models, starts and noise.
         sensors: What MPCs see in place of states.
@@ -74,8 +76,11 @@ def surroundings_of(
     slow = are_slow()
     most_models = _FEW_MODELS if slow else _CHOOSING_MODELS if choosing else _MOST_MODELS
     models = models.asked(most_models, identified=not choosing)
-    most_starts, most_steps = (_FEW_STARTS, _FEW_STEPS) if slow else (STARTS, _MOST_STEPS)
-    spare = 0 if n_starts or slow else _SPARE_CHOOSING if choosing else _SPARE
+    if n_steps is None:
+        most = _FEW_STEPS if slow else _MOST_STEPS
+        n_steps = min(most, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
+    starts = _FEW_STARTS if slow else affordable_starts(mpc, n_steps)
+    spare = 0 if n_starts or slow else (_SPARE_CHOOSING if choosing else _SPARE) * starts // STARTS
     fresh = False
     if len(clean) < len(table):
         whole = with_memory(table, mpc.layout, identified.usual_input)
@@ -83,13 +88,21 @@ def surroundings_of(
             logged, clean, fresh = whole, whole, True
             if not found.noise.negligible:
                 clean = smooth(identified, whole, found.theta, found.noise)
-    rows = initial_rows(clean, n_starts or most_starts, seed, mpc.ny, spare)
-    if n_steps is None:
-        n_steps = min(most_steps, max(_usual_length(table), min(_LEAST_STEPS, mpc.horizon)))
+    rows = initial_rows(clean, n_starts or starts, seed, mpc.ny, spare)
     n_before = mpc.layout.steps if len(clean) < len(table) else 0
     before = costs_before(table, clean, rows, n_before)
     parts = models, cost, clean, rows, max(1, n_steps - n_before), mpc.layout, seed, spare
     return Surroundings(*parts, before, n_before, logged, fresh, sensors)
+
+
+def affordable_starts(mpc: MPC, n_steps: int) -> int:
+    """From how many starts an MPC is tried for episodes of some steps: 64, of large problems 24 at least.
+
+    By the products of matrices in an iteration of its solver, ``horizon (nx + nu)^2 nx``, once a step: so the time that
+    trials take stays bounded where states are many or horizons long.
+    """
+    labour = n_steps * mpc.horizon * (mpc.nx + mpc.nu) ** 2 * mpc.nx
+    return int(np.clip(_LABOUR / labour, _FEWEST, STARTS))
 
 
 def _begins_as_usual(mpc: MPC, table: TransitionTable) -> bool:
