@@ -79,6 +79,7 @@ def test_values_and_jacobians_are_casadis(name: str) -> None:
     mpc = problem(CASES[name])
     code = source(mpc)
     assert "layer_slopes(" in code
+    assert "layer_constants(table" in code  # of the first layer
     with compiled_with(LIGHT_FLAGS):  # sooner; whole solvers with layers are compiled as shipped below
         library = compiled(code + PROBE)
     x, u, theta = ca.SX.sym("x", 4), ca.SX.sym("u", 1), ca.SX.sym("theta", mpc.space.size)
