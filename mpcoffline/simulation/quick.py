@@ -48,7 +48,9 @@ class RealTimeSolver(DDPSolver):
         self._step = 0 if begun else self._step + 1
         self._hurried = self._step % _CARRIED > 0
         self._problem.max_iterations = _FEW if self._hurried else self.max_iterations
-        return super()._solve(x, theta, u0, warm_start)
+        solution = super()._solve(x, theta, u0, warm_start)
+        solution.stats["partial"] = self._hurried
+        return solution
 
     def _run_warm(self, x: Array, theta: Array, u0: Array | None, plan: Plan) -> dict[str, NDArray[Any]]:
         result = super()._run_warm(x, theta, u0, plan)

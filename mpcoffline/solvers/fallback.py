@@ -28,7 +28,7 @@ class SolverStats:
     """What the solves of a policy have amounted to. Each failure has one answer: the last five add up to all of them.
 
     Attributes:
-        n_solves: Problems solved.
+        n_solves: Problems solved, without those whose solves were not carried through (in simulations).
         n_failures: Problems whose solution was not accepted at first.
         iterations: Solver iterations in all, those of second attempts included.
         time: Time in the solvers in s, likewise.
@@ -154,7 +154,7 @@ class Fallback:
             warm_start: The previous plan, shifted; NaN where there is none.
             solution: What was found.
         """
-        self.stats.n_solves += len(x)
+        self.stats.n_solves += 0 if solution.stats.get("partial") else len(x)
         self.stats.count(solution)
         if solution.success.all():
             return solution.u0, solution.plan.shifted(self.mpc)

@@ -41,6 +41,8 @@ class Stats(TypedDict):
         iterations: Of each problem, ``(B,)``.
         time: In s, of all.
         all_starts: Whether problems that failed were tried from all starts, of each ``(B,)`` or of all.
+        partial: Whether some iterations were all that was asked for: neither a solution nor a failure; left out where
+            the solve was carried through.
         words: What :class:`Status` says with its particulars, one text a problem, e.g. the constraint that is violated;
             left out where there are none.
         residual: Of the conditions of an optimum, relative, ``(B,)``: lqr and ipopt.
@@ -53,6 +55,7 @@ class Stats(TypedDict):
     iterations: NDArray[np.int64]
     time: float
     all_starts: NotRequired[NDArray[np.bool_] | bool]
+    partial: NotRequired[bool]
     words: NotRequired[list[str]]
     residual: NotRequired[NDArray[np.float64]]
     violation: NotRequired[NDArray[np.float64]]
