@@ -65,11 +65,11 @@ class LayeredCode:
         self.n_scalars: int = structure.n_scalars
         self._steps, self._outputs, self._nodes = structure.steps, structure.outputs, structure.nodes
         self._theta = theta
-        self._states, self._first = dict(_states(structure, nx)), nx + nu
+        self._states, self._nz = dict(_states(structure, nx)), nx + nu
         exported = self._exported()
         runs = {k: self._run(step.nodes, exported) for k, step in enumerate(self._steps) if isinstance(step, Scalars)}
         self._runs = {k: run for k, run in runs.items() if run.targets}
-        self._slots, self._size = self._allocated(self._first)
+        self._slots, self._size = self._allocated(self._nz)
         self._constant = self._constant_slopes()
         v = ca.SX.sym("v", self._size)
         self.functions: dict[str, tuple[ca.SX, ca.SX]] = {}
@@ -118,9 +118,9 @@ class LayeredCode:
 
     def _constant_slopes(self) -> dict[int, Array]:
         """Results whose derivatives by states and inputs are numbers, and these ``(nx + nu,)``: standardised ones."""
-        found = dict(zip(self._states, np.eye(self._first)[list(self._states.values())], strict=True))
+        found = dict(zip(self._states, np.eye(self._nz)[list(self._states.values())], strict=True))
         for run in self._runs.values():
-            rows, varying = {k: np.zeros(self._first) for k in run.targets}, set[int]()
+            rows, varying = {k: np.zeros(self._nz) for k in run.targets}, set[int]()
             for (k, source), slope in zip(run.edges, ca.vertsplit(run.slopes), strict=True):
                 if source in found and slope.is_constant():
                     rows[k] += float(slope) * found[source]
@@ -279,7 +279,7 @@ class LayeredCode:
         lines.append(f"for (int i = {to} * NZ; i < {to + n} * NZ; ++i) d[i] = V(0.0);")
         if run.n_by_states:
             by_states = run.edges[: run.n_by_states]
-            places = self._integers([self._slots[k] * self._first + self._slots[o] for k, o in by_states])
+            places = self._integers([self._slots[k] * self._nz + self._slots[o] for k, o in by_states])
             lines.append(f"for (int e = 0; e < {run.n_by_states}; ++e) d[{places}[e]] += g[{n} + e];")
         if others := run.edges[run.n_by_states :]:
             to_slots, from_slots = ([self._slots[o] for o in side] for side in zip(*others, strict=True))
