@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.checks import check_known
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.excerpts import excerpt
 from mpcoffline.datasets.table.transitions import TransitionTable
@@ -290,6 +291,14 @@ def _explained(inputs: Array, residual: Array) -> float:
     return 1.0 - float(np.mean(missed**2)) / variance if variance > 0.0 else 0.0
 
 
+def _by_rows(function: ca.Function) -> Callable[..., Array]:
+    """A function of rows and parameters, ``(B, m)``: numpy's, or CasADi's where numpy has not all operations."""
+    try:
+        return RowTwin(function)
+    except InvalidArgumentError:
+        return lambda *inputs: np.asarray(function(*(each.T for each in inputs)).full().T)
+
+
 def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int, reached: bool) -> MPC | None:
     """The MPC with the cost parameters that are nearest to the logged costs; None where there are none."""
     few = table.sample(count, 0)
@@ -306,8 +315,8 @@ def _with_fitted_weights(mpc: MPC, table: TransitionTable, count: int, reached: 
         return None
     x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX.sym("theta", mpc.space.size)
     cost, free = mpc.stage_function(x, u, theta), np.flatnonzero(coordinates.mask).tolist()
-    slopes = RowTwin(ca.Function("slopes", [x, u, theta], [ca.densify(ca.gradient(cost, theta)[free])]))
-    costs = RowTwin(mpc.stage_function)
+    slopes = _by_rows(ca.Function("slopes", [x, u, theta], [ca.densify(ca.gradient(cost, theta)[free])]))
+    costs = _by_rows(mpc.stage_function)
 
     def full(z: Array) -> Array:
         return np.asarray(coordinates.theta(torch.from_numpy(np.asarray(z))).numpy())

@@ -100,6 +100,10 @@ def affordable_starts(mpc: MPC, n_steps: int) -> int:
 
     By the products of matrices in an iteration of its solver, ``horizon (nx + nu)^2 nx``, once a step: so the time that
     trials take stays bounded where states are many or horizons long.
+
+    Args:
+        mpc: The MPC; only its sizes matter.
+        n_steps: Length of an episode, at least 1.
     """
     labour = n_steps * mpc.horizon * (mpc.nx + mpc.nu) ** 2 * mpc.nx
     return int(np.clip(_LABOUR / labour, _FEWEST, STARTS))

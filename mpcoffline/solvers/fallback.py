@@ -29,7 +29,7 @@ class SolverStats:
 
     Attributes:
         n_solves: Problems solved, without those whose solves were not carried through (in simulations).
-        n_failures: Problems whose solution was not accepted at first.
+        n_failures: Of these, problems whose solution was not accepted at first.
         iterations: Solver iterations in all, those of second attempts included.
         time: Time in the solvers in s, likewise.
         n_retried: Failures that were solved from all starts.
@@ -154,12 +154,13 @@ class Fallback:
             warm_start: The previous plan, shifted; NaN where there is none.
             solution: What was found.
         """
-        self.stats.n_solves += 0 if solution.stats.get("partial") else len(x)
+        partial = solution.stats.get("partial", False)
+        self.stats.n_solves += 0 if partial else len(x)
         self.stats.count(solution)
         if solution.success.all():
             return solution.u0, solution.plan.shifted(self.mpc)
         rows = np.flatnonzero(~solution.success)
-        self.stats.n_failures += len(rows)
+        self.stats.n_failures += 0 if partial else len(rows)
         states, before = x[rows], warm_start.rows(rows)
         found = _Found(solver, states, Plan(solution.x[rows].copy(), solution.u[rows].copy()), solution.value[rows])
         reasons = np.array(solution.words)[rows]
@@ -183,7 +184,8 @@ class Fallback:
             (_PREVIOUS, before.known & ~best),
             (_ZERO, ~(before.known | best)),
         ):
-            self._told(answer, chosen, reasons)
+            if not partial:
+                self._told(answer, chosen, reasons)
         return self._applied(solution, rows, best, found.plan, before)
 
     def _solve(self, solver: Solver, x: Array, warm_start: Plan | None) -> Solution:

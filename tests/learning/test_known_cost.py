@@ -17,7 +17,7 @@ from mpcoffline.diagnostics.measures import fit_errors
 from mpcoffline.estimation import identify
 from mpcoffline.learning import CostConfig, Known, StartConfig, known_cost
 from mpcoffline.learning.bellman.stages import identified
-from mpcoffline.learning.known_cost import as_logged, with_known_cost
+from mpcoffline.learning.known_cost import _by_rows, as_logged, with_known_cost
 
 Array = NDArray[np.float64]
 
@@ -230,3 +230,12 @@ def test_a_model_is_identified_where_the_plant_took_the_logged_input() -> None:
     np.testing.assert_allclose(known.mpc.theta[:2], [1.0, 0.5], rtol=1e-3)
     assert len(known.table) == len(log)
     assert as_logged(rough, log, None) is log
+
+
+def test_costs_and_slopes_by_rows_are_casadis_for_operations_that_numpy_lacks_too() -> None:
+    x, theta = ca.SX.sym("x", 2), ca.SX.sym("theta", 2)
+    rows, values = np.random.default_rng(0).normal(size=(50, 2)), np.array([1.5, 0.7])
+    for wrapped in (ca.remainder(x[0], 1.0), ca.sin(x[0])):
+        function = ca.Function("f", [x, theta], [ca.vertcat(theta[0] * wrapped**2, theta[1] * x[1])])
+        expected = np.stack([function(row, values).full()[:, 0] for row in rows])
+        np.testing.assert_allclose(_by_rows(function)(rows, values), expected, rtol=1e-14, atol=1e-15)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,6 +14,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.plants import nominal_mpc
 from mpcoffline.simulation import quick
 from mpcoffline.simulation.quick import quick_policy
+from mpcoffline.solvers import Solution
 
 Array = NDArray[np.float64]
 STEPS = 40
@@ -82,3 +86,18 @@ def test_simulated_solves_end_near_the_minimum(pendulum: MPC) -> None:
     span = float(mpc.action_high[0] - mpc.action_low[0])
     np.testing.assert_allclose(near.u0, exact.u0, atol=1e-3 * span)
     assert near.stats["iterations"].sum() <= exact.stats["iterations"].sum()
+
+
+def test_what_stalls_on_the_way_is_no_failure_either(pendulum: MPC, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else more problems would have failed than were solved."""
+    policy, x = quick_policy(pendulum), hanging(8)
+    solve = policy.solver.solve
+
+    def stalling(*args: Any, **kwargs: Any) -> Solution:
+        found = solve(*args, **kwargs)
+        return replace(found, success=np.zeros(len(x), dtype=bool)) if len(found.success) == len(x) else found
+
+    monkeypatch.setattr(policy.solver, "solve", stalling)
+    closed_loop(policy, x)
+    stats = policy.solver_stats
+    assert stats.n_failures == stats.n_solves == sum(stats.answers.values())

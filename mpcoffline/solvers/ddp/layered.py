@@ -117,7 +117,7 @@ class LayeredCode:
         return slots, size
 
     def _constant_slopes(self) -> dict[int, Array]:
-        """Results whose derivatives by states and inputs are numbers, and these ``(nx + nu,)``: standardised ones."""
+        """Results whose derivatives by states and inputs are numbers, and these ``(nx + nu,)``."""
         found = dict(zip(self._states, np.eye(self._nz)[list(self._states.values())], strict=True))
         for run in self._runs.values():
             rows, varying = {k: np.zeros(self._nz) for k in run.targets}, set[int]()

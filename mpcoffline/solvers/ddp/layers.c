@@ -35,7 +35,7 @@ static void layer_slopes(const double *W, int rows, int columns, const vd *in, v
     }
 }
 
-/* out = W, of derivatives by what a layer's sources are: states and inputs themselves */
+/* out = W: derivatives that are numbers, as of a layer whose sources are affine in states and inputs */
 static inline void layer_constants(const double *W, int rows, vd *out) {
     for (int i = 0; i < rows * NZ; ++i) out[i] = V(W[i]);
 }
