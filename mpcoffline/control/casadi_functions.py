@@ -13,7 +13,9 @@ import numpy as np
 from mpcoffline.core.errors import StorageError
 from mpcoffline.core.outputs import make_folder
 from mpcoffline.mpc import MPC
-from mpcoffline.solvers.limits import limits_of
+from mpcoffline.solvers.limits import Limits, limits_of
+
+PLAIN = ("dynamics", "stage_cost", "terminal_cost")
 
 
 class Parts(NamedTuple):
@@ -55,7 +57,7 @@ def parts_of(mpc: MPC) -> Parts:
     imposed, last = ca.SX.sym("imposed"), ca.SX.sym("last")
     reached, cost = mpc.dynamics_function(x, u, theta), mpc.stage_function(x, u, theta)
     h, slacks, soft = ca.SX(0, 1), ca.SX(0, 1), []
-    limits = limits_of(mpc, x, u, theta)
+    limits = learned_limits(mpc, x, u)
     if limits is not None:
         n, bounds = limits.n_stage, limits.n_bounds
         stages = ca.vertsplit(limits.stage) if limits.stage.numel() else []
@@ -81,6 +83,34 @@ def parts_of(mpc: MPC) -> Parts:
         slacks.numel(),
         tuple(soft),
     )
+
+
+def learned_limits(mpc: MPC, x: ca.SX, u: ca.SX) -> Limits | None:
+    """The limits in these symbols, with theta as numbers; None where there are none."""
+    theta = ca.SX.sym("theta", len(mpc.theta))  # which limits are rates is found by derivatives, of symbols alone
+    limits = limits_of(mpc, x, u, theta)
+    if limits is None:
+        return None
+    numbers = ca.SX(mpc.theta)
+    stage, end = (ca.substitute(h, theta, numbers) for h in (limits.stage, limits.end))
+    return limits._replace(stage=stage, end=end)
+
+
+def plain_functions(mpc: MPC) -> dict[str, ca.Function]:
+    """Model and costs, theta as numbers: (x, u) -> x_next, (x, u) -> cost, (x) -> cost, the ones of ``PLAIN``.
+
+    Costs are without discount and without the price of violated soft limits.
+    """
+    x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX(mpc.theta)
+    parts = (
+        ([x, u], mpc.dynamics_function(x, u, theta), ["x", "u"], "x_next"),
+        ([x, u], mpc.stage_function(x, u, theta), ["x", "u"], "cost"),
+        ([x], mpc.terminal_function(x, theta), ["x"], "cost"),
+    )
+    return {
+        name: ca.Function(name, given, [ca.densify(value)], takes, [gives])
+        for name, (given, value, takes, gives) in zip(PLAIN, parts, strict=True)
+    }
 
 
 def save_functions(functions: Mapping[str, ca.Function], folder: str | PathLike[str]) -> list[Path]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from importlib import resources
-from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 
@@ -14,10 +11,10 @@ import numpy as np
 from mpcoffline.core.outputs import check_output_folder, write_file
 from mpcoffline.mpc import MPC
 
-from .casadi_functions import Parts, parts_of, save_functions
+from .casadi_functions import PLAIN, Parts, parts_of, plain_functions, save_functions
+from .controller_script import script_of
 from .loading import Acting, load_policy
 
-_PLAIN = ("dynamics", "stage_cost", "terminal_cost")
 _PROGRAM = ("nlp", "bounds", "start", "plan")
 _SCRIPT = "casadi_controller.py"
 
@@ -54,25 +51,12 @@ def export_casadi(policy: Acting | str | PathLike[str], folder: str | PathLike[s
         FileFormatError: If the file is damaged or foreign.
         StorageError: If nothing could be written there.
     """
-    check_output_folder(folder, (_SCRIPT, *(f"{name}.casadi" for name in (*_PLAIN, *_PROGRAM))))
+    check_output_folder(folder, (_SCRIPT, *(f"{name}.casadi" for name in (*PLAIN, *_PROGRAM))))
     mpc = (policy if isinstance(policy, Acting) else load_policy(policy)).mpc
-    functions = _plain(mpc) | program_of(mpc, parts_of(mpc))
-    script = write_file(Path(folder) / _SCRIPT, _script(mpc))
+    functions = plain_functions(mpc) | program_of(mpc, parts_of(mpc))
+    sizes = f"{mpc.nx}, {mpc.nu}, {mpc.horizon}"
+    script = write_file(Path(folder) / _SCRIPT, script_of(mpc, "casadi_controller.txt", SIZES=sizes))
     return [script, *save_functions(functions, folder)]
-
-
-def _plain(mpc: MPC) -> dict[str, ca.Function]:
-    """Model and costs, theta as numbers."""
-    x, u, theta = ca.SX.sym("x", mpc.nx), ca.SX.sym("u", mpc.nu), ca.SX(mpc.theta)
-    parts = (
-        ([x, u], mpc.dynamics_function(x, u, theta), ["x", "u"], "x_next"),
-        ([x, u], mpc.stage_function(x, u, theta), ["x", "u"], "cost"),
-        ([x], mpc.terminal_function(x, theta), ["x"], "cost"),
-    )
-    return {
-        name: ca.Function(name, given, [ca.densify(value)], takes, [gives])
-        for name, (given, value, takes, gives) in zip(_PLAIN, parts, strict=True)
-    }
 
 
 def program_of(mpc: MPC, parts: Parts) -> dict[str, ca.Function]:
@@ -115,18 +99,3 @@ def program_of(mpc: MPC, parts: Parts) -> dict[str, ca.Function]:
         "start": ca.Function("start", [p, inputs], [ca.vertcat(*rolled)], ["p", "u"], ["x"]),
         "plan": ca.Function("plan", [w, p], [ca.horzcat(*xs), ca.horzcat(*us)], ["w", "p"], ["x", "u"]),
     }
-
-
-def _script(mpc: MPC) -> str:
-    layout = mpc.layout
-    states = [*map(str, layout.y_labels), *(f"{name}, an input of an earlier step" for name in layout.names)]
-    replaced = {
-        "CASADI": version("casadi"),
-        "STATES": "\n".join(f"    x[{i}]  {name}" for i, name in enumerate(states)),
-        "INPUTS": "\n".join(f"    u[{i}]  {label}" for i, label in enumerate(layout.u_labels)),
-        "SIZES": f"{mpc.nx}, {mpc.nu}, {mpc.horizon}",
-        "DT": f"{float(mpc.model.dt):g}",
-        "USUAL": repr(np.asarray(mpc.usual_input, dtype=np.float64).tolist()),
-    }
-    text = resources.files(__package__).joinpath("casadi_controller.txt").read_text(encoding="utf-8")
-    return re.sub(r"@([A-Z]+)@", lambda match: replaced[match[1]], text)

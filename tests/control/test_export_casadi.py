@@ -27,7 +27,9 @@ def script_of(folder: Path) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize(("case", "count"), [(PENDULUM, 100), ("late, with a signal", 20), ("limits", 5)])
+@pytest.mark.parametrize(
+    ("case", "count"), [(PENDULUM, 100), ("late, with a signal", 20), ("late, with rates", 5), ("limits", 5)]
+)
 def test_ipopt_on_the_exported_program_decides_what_ours_decides(case: str, count: int, tmp_path: Path) -> None:
     mpc, observations = of_case(case)
     export_casadi(MPCPolicy(mpc), tmp_path)

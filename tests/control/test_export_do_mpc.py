@@ -19,7 +19,7 @@ from mpcoffline.solvers import DDPSolver
 
 
 @pytest.mark.interop
-@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "late, with a signal", "limits"])
+@pytest.mark.parametrize("case", [LINEAR, PENDULUM, CARTPOLE, "late, with a signal", "late, with rates", "limits"])
 def test_do_mpc_decides_what_ours_decides(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("do_mpc")
     mpc, observations = of_case(case)

@@ -33,6 +33,21 @@ def of_case(case: str) -> tuple[MPC, NDArray[np.float64]]:
         observations = rng.uniform(-1.0, 1.0, (N_OBSERVATIONS, 3))
         priced = QuadraticCost(np.diag([1.0, 0.1]), [[0.1]], D=[[0.2]])
         return MPC(model, priced, goal, 20, 0.95, [-1.0], [1.0]), observations
+    if case == "late, with rates":
+        model = Model(
+            lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], 0.9 * x[1] + 0.3 * ca.sin(u[0])),
+            2,
+            1,
+            0.2,
+            discrete=True,
+            delay=1,
+        )
+        limits = [
+            Constraint(lambda x, u, before, p: ca.vertcat(u - before, before - u) - 0.25, "rate", uses_previous=True),
+            StateBounds([-np.inf, -0.3], [np.inf, 0.3], "speed", Penalty(2.0, 4.0)),
+        ]
+        observations = rng.uniform([-1.0, -0.4], [1.0, 0.4], (N_OBSERVATIONS, 2))
+        return MPC(model, stage, goal, 20, 0.97, [-1.0], [1.0], constraints=limits), observations
     limits = [
         StateBounds([-np.inf, -0.4], [np.inf, 0.4], "speed", Penalty(3.0)),
         Constraint(lambda x, u, p: ca.vertcat(x[1] * u[0] - 0.2, -x[1] * u[0] - 0.2), "power"),
