@@ -23,6 +23,7 @@ class Target(StrEnum):
 
     c = "c"
     do_mpc = "do-mpc"
+    acados = "acados"
     casadi = "casadi"
     fmi = "fmi"
     onnx = "onnx"
@@ -32,6 +33,7 @@ class Target(StrEnum):
     epilog=examples(
         "mpcoffline export learner_policy.zip --out controller/",
         "mpcoffline export learner_policy.zip --to do-mpc --out controller/",
+        "mpcoffline export learner_policy.zip --to acados --out controller/",
         "mpcoffline export learner_policy.zip --to casadi --out controller/",
         "mpcoffline export learner_policy.zip --to fmi --out controller/",
         "mpcoffline export distilled.zip --to c --out controller/",
@@ -41,7 +43,7 @@ class Target(StrEnum):
 def export(
     policy: Controller,
     to: Annotated[
-        Target, typer.Option(help="C99, a script for do-mpc, CasADi's files of the problem, an FMU, or ONNX.")
+        Target, typer.Option(help="C99, a script for do-mpc or acados, CasADi's files of the problem, an FMU, or ONNX.")
     ] = Target.c,
     out: Annotated[Path, typer.Option(help="Folder for the files.", file_okay=False)] = Path("controller"),
 ) -> None:
@@ -52,6 +54,8 @@ def export(
     policy, as `mpcoffline distill` makes it, is below 20 kB.
 
     With `--to do-mpc`: a script for do-mpc that makes the same controller, and its functions as CasADi's files.
+
+    With `--to acados`: the same for acados, whose solver is C.
 
     With `--to casadi`: model, costs and the whole nonlinear program as CasADi's files, and a script that solves it.
 
@@ -80,11 +84,17 @@ def _exported(policy: Path, to: Target, out: Path) -> list[Path]:
         if isinstance(controller, DistilledPolicy):
             return export_explicit_c(controller, out)
         return export_c(controller, out)
+    from mpcoffline.control.export_acados import export_acados
     from mpcoffline.control.export_casadi import export_casadi
     from mpcoffline.control.export_do_mpc import export_do_mpc
     from mpcoffline.control.export_fmi import export_fmi
 
-    written = {Target.do_mpc: export_do_mpc, Target.fmi: export_fmi, Target.casadi: export_casadi}
+    written = {
+        Target.do_mpc: export_do_mpc,
+        Target.acados: export_acados,
+        Target.fmi: export_fmi,
+        Target.casadi: export_casadi,
+    }
     return written[to](loaded_policy(policy), out)
 
 

@@ -48,5 +48,6 @@ def test_from_the_policy_to_its_network_and_out() -> None:
 
 def test_what_is_written_for_other_programs() -> None:
     assert "nlp.casadi" in said("export", "policy.zip", "--to", "casadi", "--out", "there")
+    assert "acados_controller.py" in said("export", "policy.zip", "--to", "acados", "--out", "there")
     assert "no network" in said("export", "policy.zip", "--to", "onnx", exit_code=1)
     assert "--data" in said("distill", "policy.zip", exit_code=2)
