@@ -33,6 +33,11 @@ class RowTwin:
         large = TorchTwin(function) if flat.n_instructions() > LARGE and may_be_layered(flat) else None
         self._twin = large if large is not None and large.in_layers else NumpyTwin(function)
 
+    @property
+    def by_numpy(self) -> bool:
+        """Whether numpy evaluates it."""
+        return isinstance(self._twin, NumpyTwin)
+
     def __call__(self, *inputs: Array) -> Array:
         """The first output, ``(..., m)``.
 

@@ -13,6 +13,7 @@ from mpcoffline.learning.stages import KnownCost
 from mpcoffline.learning.value.fit import ValueFunction
 from mpcoffline.mpc import MPC
 from mpcoffline.mpc.scaling import increments_scale
+from mpcoffline.mpc.theta_twin import ThetaTwin
 from mpcoffline.mpc.torch_twin import TorchTwin
 
 
@@ -37,7 +38,7 @@ class BellmanProblem:
     unit: float
 
     def __init__(self, mpc: MPC, value: ValueFunction, unit: float, cost: KnownCost | None = None) -> None:
-        self._f, self._stage = TorchTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
+        self._f, self._stage = ThetaTwin(mpc.dynamics_function), TorchTwin(mpc.stage_function)
         self.n_states, self._ny = mpc.layout.n_states, mpc.ny
         self._value, self._discount, self.unit = value, mpc.discount, unit
         self._scale, self._of_reached = (1.0, False) if cost is None else (cost.scale, cost.reached)
