@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, MPCOfflineError, UnknownIdError
-from mpcoffline.learning.distillation import network, network_jacobian
+from mpcoffline.learning.distillation import network, network_jacobian, squares
 from mpcoffline.learning.terminal import DistillConfig, fit_terminal, terminal_error
 from mpcoffline.mpc import NetworkCost, QuadraticCost
 
@@ -153,6 +153,13 @@ def test_the_jacobian_is_that_of_autograd(n_layers: int) -> None:
 
 
 # ---------------------------------------------------------------- data as they come
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 41])
+def test_squares_are_those_of_the_jacobian_below_its_diagonal(size: int) -> None:
+    jacobian = torch.from_numpy(cloud(200, size))
+    expected = torch.tril(jacobian.T @ jacobian)
+    torch.testing.assert_close(torch.tril(squares(jacobian)), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["quadratic", "network"])
