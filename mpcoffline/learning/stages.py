@@ -16,7 +16,7 @@ from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.shards import Change as RowChange, ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.estimation import Identification
-from mpcoffline.mpc import MPC
+from mpcoffline.mpc import MPC, TerminalCost
 
 from .limit_costs import LimitCosts
 from .potential import Potential
@@ -167,6 +167,7 @@ class Known:
         start: An MPC that was learned before, where searches begin, too; None without.
         begun: The first transitions of episodes as they were logged; None where no past inputs are in the state.
         shards: All transitions, where the table is an excerpt of them: what minibatches are drawn from.
+        distilled: Where the terminal cost is V and nothing else: where its quadratic has its minimum, and itself.
     """
 
     mpc: MPC
@@ -185,6 +186,7 @@ class Known:
     start: MPC | None = None
     begun: TransitionTable | None = None
     shards: ShardedTable | None = None
+    distilled: tuple[Array, TerminalCost] | None = None
 
     def with_rows(self, change: RowChange) -> Known:
         """The same with something done to the transitions, in memory and in shards.

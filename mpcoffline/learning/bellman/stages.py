@@ -26,7 +26,7 @@ from mpcoffline.learning.terminal import fit_terminal
 from mpcoffline.learning.value.config import ValueConfig
 from mpcoffline.learning.value.function import ValueFunction
 from mpcoffline.learning.value.training import ValueTraining
-from mpcoffline.mpc import MPC, Model, NormCost, TerminalCost
+from mpcoffline.mpc import MPC, Model, NetworkCost, NormCost, TerminalCost
 from mpcoffline.mpc.penalties import paid_in_value, repriced
 
 from .regression import ParameterConfig, ParameterTraining
@@ -243,20 +243,44 @@ def with_terminal_cost(known: Known, config: TerminalConfig, *, horizon: int | N
     if exact is not None:
         _log.info("The learned MPC is linear-quadratic: its terminal cost is its exact value")
     elif config.method != "norm":
-        value, potential = known.constant_value, None if known.result is None else known.result.potential
-        cost = fit_terminal(
-            "quadratic" if config.method == "quadratic" else "network",
-            partial(_terminal, known, value, potential),
-            known.table.sample(_TERMINAL_ROWS, 0).observations,
-            x_ref=goal,
-            blend=config.blend,
-            seed=known.seed,
-            ends=_ends(known, potential),
-        )
+        cost, distilled = _distilled(known, config, goal)
+        known = replace(known, distilled=distilled)
     mpc = known.mpc.replace(terminal_cost=cost)
     if exact is None and config.method != "norm" and known.limits is not None:
         mpc = paid_in_value(mpc)
     return replace(known, mpc=mpc, result=None if known.result is None else replace(known.result, theta=mpc.theta))
+
+
+def with_terminal_form(known: Known, config: TerminalConfig) -> MPC:
+    """The MPC with a terminal cost of the kind that :func:`with_terminal_cost` will find, mostly, with any numbers."""
+    mpc, constant = repriced_as_logged(known.mpc, known), known.cost is not None and known.cost.constant
+    if constant or config.method not in ("network", "auto"):
+        return mpc
+    if config.method == "auto" and riccati_cost(mpc) is not None and not ends_matter(known.table, mpc.discount):
+        return mpc
+    mpc = mpc.replace(terminal_cost=NetworkCost.random(mpc.nx, seed=0))
+    return mpc if known.limits is None else paid_in_value(mpc)
+
+
+def _distilled(
+    known: Known, config: TerminalConfig, goal: Array
+) -> tuple[TerminalCost, tuple[Array, TerminalCost] | None]:
+    """T from V, and once more with its goal where it is V alone: another MPC's is the same then, if its goal is."""
+    value, potential = known.constant_value, None if known.result is None else known.result.potential
+    ends = _ends(known, potential)
+    alone = potential is None and known.cost is None and ends is None
+    if alone and known.distilled is not None and np.array_equal(known.distilled[0], goal):
+        return known.distilled[1], known.distilled
+    cost = fit_terminal(
+        "quadratic" if config.method == "quadratic" else "network",
+        partial(_terminal, known, value, potential),
+        known.table.sample(_TERMINAL_ROWS, 0).observations,
+        x_ref=goal,
+        blend=config.blend,
+        seed=known.seed,
+        ends=ends,
+    )
+    return cost, (goal, cost) if alone else None
 
 
 def _terminal(known: Known, value: ValueFunction, potential: Potential | None, s: torch.Tensor) -> torch.Tensor:
