@@ -21,7 +21,9 @@ from .trials import Surroundings
 
 STARTS = 64
 _FEWEST = 24  # where each is dear
-_LABOUR = 1.28e8  # multiplications of one iteration of all solves from all starts on a model; 64 starts of most plants
+_LABOUR = (
+    8e7  # multiplications of one iteration of all solves from all starts on a model; 64 starts of nearly all plants
+)
 _SPARE_CHOOSING, _SPARE = 40, 128  # beside 64
 _MOST_STEPS = 400
 _MOST_MODELS, _CHOOSING_MODELS = 7, 4
