@@ -23,6 +23,23 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """One thread for torch until the block ends; also as a decorator.
+
+    For steps of a millisecond or two. A second thread gains a seventh of them, and where another process has its core,
+    as a compiler, each step waits for it: ten times as long was seen. And sums are rounded alike on any machine.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def at_leisure(jobs: Sequence[Callable[[], T]]) -> Iterator[T]:
     """What some jobs give, one after the other, of which the later ones may not be asked for.
 

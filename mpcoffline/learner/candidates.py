@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -190,6 +191,17 @@ def check_also(nominal: MPC, also: Mapping[str, MPC]) -> None:
             raise InvalidArgumentError(f"also: {name}", expected=expected, actual=actual)
 
 
+@contextmanager
+def compiling_ahead(learner: OfflineMPCLearner) -> Iterator[Callable[[list[MPC]], None]]:
+    """Gives what has solvers compiled beside the regressions, where a choice will ask for them.
+
+    Args:
+        learner: The learner.
+    """
+    with Ahead(None if learner.candidate == "auto" else 0) as ahead:
+        yield lambda mpcs: ahead.start(mpcs if learner.softening is None else map(learner.softening, mpcs))
+
+
 def candidates_of(
     learner: OfflineMPCLearner,
     run: Run,
@@ -217,18 +229,16 @@ def candidates_of(
     ready = _as_it_is if soft is None else soft
     if learner.candidate == "auto":
         show, begun = partial(bars.show, "choosing on models of the log"), core_seconds()
-        with Ahead() as ahead:
-            ahead.start([ready(known.mpc), ready(nominal)])  # most candidates' code is that of one of these two
-            between = run.method.candidates(known)
-            if not between:
-                if learner.polish:
-                    logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
-                return None
-            how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
-            how |= {"kept": kept, "learned_in": learned_in, "sensors": learner.sensors, "ready": ready}
-            known, between = fine_enough(known, between, table, ready)
-            variants = partial(run.method.variants, known)
-            return tried(nominal, known, {**between, **also}, table, variants, show, begun=begun, **how)
+        between = run.method.candidates(known)
+        if not between:
+            if learner.polish:
+                logger.warning("Not polished: %s knows of no candidates.", type(run.method).__name__)
+            return None
+        how: dict[str, Any] = {"polish": learner.polish, "keep_limits": learner.keep_limits}
+        how |= {"kept": kept, "learned_in": learned_in, "sensors": learner.sensors, "ready": ready}
+        known, between = fine_enough(known, between, table, ready)
+        variants = partial(run.method.variants, known)
+        return tried(nominal, known, {**between, **also}, table, variants, show, begun=begun, **how)
     between = {} if learner.candidate == FULL else run.method.candidates(known)
     mpcs = {FIRST: nominal, **between, **also, FULL: known.mpc}
     for turn in (1, 0, 1):  # a variant, and one of a variant

@@ -30,7 +30,7 @@ from mpcoffline.mpc.shown import parameter_table
 from mpcoffline.simulation.polishing import check_search
 
 from .callbacks import Callback, Evaluator, asks_to_end, check_callbacks
-from .candidates import Candidates, candidates_of, check_also
+from .candidates import Candidates, candidates_of, check_also, compiling_ahead
 from .checkpoint import Checkpoint, History
 from .effort import core_seconds
 from .files import read_learner, write_learner
@@ -301,7 +301,8 @@ class OfflineMPCLearner:
             for callback in callbacks:
                 if (end := getattr(callback, "on_fit_end", None)) is not None:
                     ending.callback(end)
-            for epoch in run.epochs(n_steps_per_epoch, bars.busy):
+            foresee = ending.enter_context(compiling_ahead(self))
+            for epoch in run.epochs(n_steps_per_epoch, bars.busy, foresee):
                 self.value_function, self.result = run.value_function, run.result
                 self._mpc, self._policy, self._observation_space = self._ready(run), None, observation_space
                 metrics = dict(epoch.metrics)

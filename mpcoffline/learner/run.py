@@ -76,12 +76,18 @@ class Run:
         self._trainings: dict[str, Training] = {}
         self._restored: dict[str, Arrays] = {}
 
-    def epochs(self, n_steps: int | None = None, tell: Callable[[str], None] = lambda _: None) -> Iterator[Epoch]:
+    def epochs(
+        self,
+        n_steps: int | None = None,
+        tell: Callable[[str], None] = lambda _: None,
+        foresee: Callable[[list[MPC]], None] = lambda _: None,
+    ) -> Iterator[Epoch]:
         """Runs the stages; yields at the end of each epoch.
 
         Args:
             n_steps: Steps in an epoch; by default what each stage says.
             tell: Is told the name of what begins now and has no epochs.
+            foresee: Is given, before the first step, MPCs of the form that will be tried at the end.
 
         Raises:
             InvalidDataError: If the data do not fit.
@@ -96,6 +102,8 @@ class Run:
             if not isinstance(stage, Stage):
                 known = stage(known)
                 continue
+            if not self._trainings:
+                foresee(self.method.foreseen(known))
             training = stage.begin(known)
             if training is None:
                 continue

@@ -77,6 +77,16 @@ class Method(ABC):
         """What the stages begin with, found from all transitions; by default what is known already."""
         return known
 
+    def foreseen(self, known: Known) -> list[MPC]:
+        """MPCs of the form that what is tried at the end will have, whatever its numbers; by default none.
+
+        Their solvers are compiled while the regressions run.
+
+        Args:
+            known: What is known before the first stage that takes steps.
+        """
+        return []
+
     def candidates(self, known: Known) -> dict[str, MPC]:
         """MPCs that the fit knows by the way and that may do better than the whole of it; by default none.
 

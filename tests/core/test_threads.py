@@ -11,7 +11,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mpcoffline.core.threads import one_blas_thread, side_by_side
+from mpcoffline.core.threads import one_blas_thread, one_torch_thread, side_by_side
 
 
 @pytest.fixture
@@ -75,3 +75,10 @@ def test_whoever_asks_takes_part() -> None:
     assert threading.get_ident() in done
     assert len(set(done)) == 2
     assert set(side_by_side([threading.get_ident] * 3, workers=1)) == {threading.get_ident()}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_torch_has_one_thread_inside_and_as_many_as_before_outside() -> None:
+    with one_torch_thread():
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,15 @@ from lq_episodes import episodes
 from mpcoffline import MPCPolicy, OfflineMPCLearner
 from mpcoffline.core.archive import read_archive
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, UnknownIdError
-from mpcoffline.learner.candidates import FULL
+from mpcoffline.learner.candidates import FULL, compiling_ahead
 from mpcoffline.learner.effort import Effort
 from mpcoffline.mpc import MPC
 from mpcoffline.simulation import polishing
 from mpcoffline.simulation.choice import FIRST
 from mpcoffline.simulation.polishing import Polished
 from mpcoffline.simulation.trials import Trials
+from mpcoffline.solvers.ddp import Ahead
+from mpcoffline.solvers.ddp.codegen import source
 
 QUICK: dict[str, Any] = {"value_n_steps": 60, "fit_n_steps": 20, "hidden": (16,), "terminal": "quadratic", "seed": 0}
 LOG = episodes(n=40, steps=30)
@@ -238,3 +242,27 @@ def test_further_candidates_take_part() -> None:
     for also, message in (({FULL: best}, "other names than"), ({"a\n": best}, "candidate")):
         with pytest.raises(InvalidArgumentError, match=message):
             learner.fit(LOG, also=also)
+
+
+@pytest.mark.parametrize("terminal", ["network", "auto", "given"])
+def test_solvers_are_compiled_ahead_of_the_numbers(monkeypatch: pytest.MonkeyPatch, terminal: str) -> None:
+    """What is compiled before the first step is the code of what is tried at the end."""
+    foreseen: list[str] = []
+
+    class Noting(Ahead):
+        def start(self, mpcs: Iterable[MPC]) -> None:
+            foreseen.extend(map(source, mpcs))
+
+    compiling = compiling_ahead
+
+    @contextmanager
+    def noting(learner: OfflineMPCLearner) -> Iterator[Callable[[list[MPC]], None]]:
+        with monkeypatch.context() as patch:
+            patch.setattr("mpcoffline.learner.candidates.Ahead", Noting)
+            with compiling(learner) as start:
+                yield start
+
+    monkeypatch.setattr("mpcoffline.learner.learner.compiling_ahead", noting)
+    learner = fitted(terminal=terminal, learn="cost+model")
+    assert learner.candidates is not None
+    assert {source(learner.candidates[name]) for name in (FIRST, FULL)} <= set(foreseen)

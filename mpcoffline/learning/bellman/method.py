@@ -26,6 +26,7 @@ from .stages import (
     identified,
     with_dead_time,
     with_terminal_cost,
+    with_terminal_form,
 )
 
 
@@ -72,6 +73,12 @@ class Bellman(Method):
         if "constraints" in known.groups:
             check_limit_parameters(known.mpc)
         return with_dead_time(replace(known, mpc=with_profiles(known.mpc, known.table)), self.identify)
+
+    def foreseen(self, known: Known) -> list[MPC]:
+        """The whole fit, of which all but the numbers is known, and MPC_1; nothing where there will be no choice."""
+        if known.given is None or known.found is None:
+            return []
+        return [with_terminal_form(known, self.terminal), known.given]
 
     def candidates(self, known: Known) -> dict[str, MPC]:
         """The identified model with the costs that were given, and with V; see :func:`candidates`."""

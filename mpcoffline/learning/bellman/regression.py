@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mpcoffline.core.checks import check_integers, check_number
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError
 from mpcoffline.core.text import listed
+from mpcoffline.core.threads import one_torch_thread
 from mpcoffline.core.types import Array
 from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
@@ -164,6 +165,7 @@ class ParameterTraining:
         """Whether all steps are made."""
         return self.step >= self.n_steps
 
+    @one_torch_thread()
     def advance(self, n: int) -> Metrics:
         """Makes n more gradient steps, fewer at the end of an attempt, and alone the last step; returns the error."""
         if self.step >= self._n_gradients:

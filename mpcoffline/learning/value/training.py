@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOfflineError
+from mpcoffline.core.threads import one_torch_thread
 from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import Columns, TransitionTable
 from mpcoffline.learning.reduction import Source
@@ -27,6 +29,7 @@ from .units import Units
 VALIDATE_EVERY = 250  # steps
 _VALIDATION_ROWS = 8_192
 _LOST = 25  # steps in a row without a finite gradient
+_SMALL = 1e8  # products of a step, a weight and a row, below which one thread is as good as several
 
 _log = logging.getLogger(__name__)
 
@@ -119,15 +122,20 @@ class ValueTraining:
             MPCOfflineError: If the loss stays NaN or infinite.
         """
         losses: list[float] = []
-        for _ in range(n):
-            if self.done:
-                break
-            self.step += 1
-            losses += self._gradient_step()
-            if self.step % VALIDATE_EVERY == 0 or self.step == self.n_steps:
-                self._validate()
+        with one_torch_thread() if self._is_small else nullcontext():
+            for _ in range(n):
+                if self.done:
+                    break
+                self.step += 1
+                losses += self._gradient_step()
+                if self.step % VALIDATE_EVERY == 0 or self.step == self.n_steps:
+                    self._validate()
         metrics = {"value_loss": float(np.mean(losses)) if losses else math.nan}
         return metrics if self._validation is None else metrics | {"validation_loss": self._validation_loss}
+
+    @property
+    def _is_small(self) -> bool:
+        return self._config.batch_size * self._members[0].critic.weights[0].numel() < _SMALL
 
     @property
     def result(self) -> ValueFunction:
