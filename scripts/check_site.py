@@ -110,8 +110,8 @@ def check_pictures(site: Path, out: Path) -> int:
                 found = driver.execute_async_script(LOOK)
                 found += [f"browser: {e['message']}" for e in driver.get_log("browser") if e["level"] == "SEVERE"]
                 picture = picture_of(driver, width)
-                picture.save(out / f"{page.removesuffix('.html').replace('/', '-')}-{name}.png")
-                if is_blank(picture):
+                (out / f"{page.removesuffix('.html').replace('/', '-')}-{name}.png").write_bytes(picture)
+                if is_blank(Image.open(BytesIO(picture))):
                     found.append("blank")
                 for sentence in found:
                     print(f"{page} ({name}): {sentence}", file=sys.stderr)
@@ -137,12 +137,12 @@ def browser() -> Iterator[webdriver.Chrome]:
         driver.quit()
 
 
-def picture_of(driver: webdriver.Chrome, width: int) -> Image.Image:
-    """The whole page, not only what the screen shows."""
+def picture_of(driver: webdriver.Chrome, width: int) -> bytes:
+    """The whole page, not only what the screen shows, as a PNG, larger and sooner there than the smallest one."""
     height = min(driver.execute_script("return document.documentElement.scrollHeight"), MAX_HEIGHT)
     clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
-    shot = driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})
-    return Image.open(BytesIO(base64.b64decode(shot["data"])))
+    how = {"captureBeyondViewport": True, "optimizeForSpeed": True, "clip": clip}
+    return base64.b64decode(driver.execute_cdp_cmd("Page.captureScreenshot", how)["data"])
 
 
 def is_blank(picture: Image.Image) -> bool:
