@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,13 +26,15 @@ def one_blas_thread() -> Iterator[None]:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """One thread for torch until the block ends; also as a decorator.
+    """One thread in torch, where torch is loaded, until the block ends; also as a decorator.
 
-    For steps of a millisecond or two. A second thread gains a seventh of them, and where another process has its core,
-    as a compiler, each step waits for it: ten times as long was seen. And sums are rounded alike on any machine.
+    For jobs beside others, and for steps of a millisecond or two: a second thread gains a seventh of them, and where
+    another process has its core, as a compiler, each step waits for it: ten times as long was seen.
     """
-    import torch
-
+    torch = sys.modules.get("torch")
+    if torch is None:  # the environment variables see to it
+        yield
+        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

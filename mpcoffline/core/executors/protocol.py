@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +11,7 @@ from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from mpcoffline.core.errors import InvalidArgumentError, MPCOfflineError
 from mpcoffline.core.registry import Registry
+from mpcoffline.core.threads import one_torch_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -158,18 +158,3 @@ def at_work() -> Iterator[None]:
 def is_at_work() -> bool:
     """Whether this process works for another one."""
     return bool(_AT_WORK)
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """One thread in torch, where torch is loaded; the environment variables see to it where it is not yet."""
-    torch = sys.modules.get("torch")
-    if torch is None:
-        yield
-        return
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 
-from .protocol import EXECUTORS, Executor, Job, Result, described, job_error, one_torch_thread
+from mpcoffline.core.threads import one_torch_thread
+
+from .protocol import EXECUTORS, Executor, Job, Result, described, job_error
 
 
 @EXECUTORS.register("serial")
