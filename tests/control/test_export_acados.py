@@ -6,7 +6,6 @@ acados_template on the path, ``pytest -m interop`` runs the last test.
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -15,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from exported_problems import N_OBSERVATIONS, of_case
+from exported_problems import N_OBSERVATIONS, of_case, script_in
 from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline import MPCPolicy
@@ -24,15 +23,6 @@ from mpcoffline.core.errors import StorageError
 from mpcoffline.solvers import DDPSolver
 
 CASES = [LINEAR, PENDULUM, CARTPOLE, "late, with a signal", "late, with rates", "limits"]
-
-
-def script_of(folder: Path) -> Any:
-    spec = importlib.util.spec_from_file_location("acados_controller", folder / "acados_controller.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -70,7 +60,7 @@ def test_the_described_problem_is_ours(case: str, tmp_path: Path) -> None:
     """Plans of ours keep its limits and cost what our solver says: discount, prices of violated limits and all."""
     mpc, observations = of_case(case)
     export_acados(MPCPolicy(mpc), tmp_path)
-    problem = script_of(tmp_path).ocp()
+    problem = script_in(tmp_path, "acados_controller").ocp()
     model, options, bounds = problem.model, problem.solver_options, problem.constraints
     assert (options.N_horizon, options.tf) == (mpc.horizon, pytest.approx(mpc.horizon * mpc.model.dt))
     assert options.integrator_type == "DISCRETE"
@@ -104,7 +94,7 @@ def test_limits_are_imposed_where_something_can_be_done_about_them(tmp_path: Pat
     """Not on the state that is given: power, of the input, is the first stage's only limit."""
     mpc, _ = of_case("limits")
     export_acados(MPCPolicy(mpc), tmp_path)
-    problem = script_of(tmp_path).ocp()
+    problem = script_in(tmp_path, "acados_controller").ocp()
     assert [len(getattr(problem.constraints, f"uh{at}")) for at in ("_0", "", "_e")] == [2, 4, 4]
     assert [list(getattr(problem.constraints, f"idxsh{at}")) for at in ("_0", "", "_e")] == [[], [2, 3], [0, 1, 2, 3]]
     np.testing.assert_allclose(problem.cost.zu, [3.0, 3.0])
@@ -115,7 +105,7 @@ def test_limits_are_imposed_where_something_can_be_done_about_them(tmp_path: Pat
 @pytest.mark.usefixtures("described")
 def test_options_are_acados_own(tmp_path: Path) -> None:
     export_acados(MPCPolicy(of_case(LINEAR)[0]), tmp_path)
-    problem = script_of(tmp_path).ocp(nlp_solver_max_iter=7, nlp_solver_type="SQP_RTI")
+    problem = script_in(tmp_path, "acados_controller").ocp(nlp_solver_max_iter=7, nlp_solver_type="SQP_RTI")
     assert (problem.solver_options.nlp_solver_max_iter, problem.solver_options.nlp_solver_type) == (7, "SQP_RTI")
 
 
@@ -149,7 +139,7 @@ def test_acados_decides_what_ours_decides(case: str, tmp_path: Path) -> None:
     pytest.importorskip("acados_template")
     mpc, observations = of_case(case)
     export_acados(MPCPolicy(mpc), tmp_path)
-    controller = script_of(tmp_path).Controller()
+    controller = script_in(tmp_path, "acados_controller").Controller()
     width = np.asarray(mpc.action_high) - np.asarray(mpc.action_low)
     states = mpc.state(observations)
     solved = DDPSolver(mpc, tolerance=1e-16).solve(states)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
-from types import ModuleType
 
 import casadi as ca
 import numpy as np
 import pytest
-from exported_problems import of_case
+from exported_problems import of_case, script_in
 from task_ids import CARTPOLE, LINEAR, PENDULUM
 
 from mpcoffline import MPCPolicy
@@ -18,22 +16,13 @@ from mpcoffline.core.errors import StorageError
 from mpcoffline.solvers import DDPSolver
 
 
-def script_of(folder: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("casadi_controller", folder / "casadi_controller.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize(
     ("case", "count"), [(PENDULUM, 100), ("late, with a signal", 20), ("late, with rates", 5), ("limits", 5)]
 )
 def test_ipopt_on_the_exported_program_decides_what_ours_decides(case: str, count: int, tmp_path: Path) -> None:
     mpc, observations = of_case(case)
     export_casadi(MPCPolicy(mpc), tmp_path)
-    decide = script_of(tmp_path).controller()
+    decide = script_in(tmp_path, "casadi_controller").controller()
     width = np.asarray(mpc.action_high) - np.asarray(mpc.action_low)
     states = mpc.state(observations[:count])
     solved = DDPSolver(mpc, tolerance=1e-12).solve(states)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
 import casadi as ca
 import numpy as np
 from mpc_problems import random_states
@@ -56,3 +60,13 @@ def of_case(case: str) -> tuple[MPC, NDArray[np.float64]]:
     model = Model(lambda x, u, p: ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * ca.sin(u[0])), 2, 1, 0.2, discrete=True)
     observations = rng.uniform([-1.0, -0.5], [1.0, 0.5], (N_OBSERVATIONS, 2))
     return MPC(model, stage, goal, 20, 0.97, [-1.0], [1.0], constraints=limits), observations
+
+
+def script_in(folder: Path, name: str) -> ModuleType:
+    """A script that was written, as a module."""
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

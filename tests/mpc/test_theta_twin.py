@@ -1,4 +1,4 @@
-"""Functions of rows and one theta: values and gradients against torch's autograd and closed forms."""
+"""Functions of rows and one theta: values and gradients against torch's autograd."""
 
 from __future__ import annotations
 
