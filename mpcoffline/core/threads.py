@@ -46,14 +46,16 @@ def one_torch_thread() -> Iterator[None]:
 def at_leisure(jobs: Sequence[Callable[[], T]]) -> Iterator[T]:
     """What some jobs give, one after the other, of which the later ones may not be asked for.
 
-    With one thread (of torch), each is done when it is asked for; with several, :func:`side_by_side`.
+    With one thread (of torch), each is done when it is asked for; with several, :func:`side_by_side`. Either way a job
+    has one.
     """
     import torch
 
     if min(torch.get_num_threads(), len(jobs)) > 1:
         yield from side_by_side(jobs)
     else:
-        yield from (job() for job in jobs)
+        for job in jobs:
+            yield one_torch_thread()(job)()
 
 
 def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) -> list[T]:
@@ -65,7 +67,7 @@ def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) ->
 
     Args:
         jobs: What to do; whoever is free takes the next one.
-        workers: How many threads; as many as torch has by default.
+        workers: How many threads; by default as many as torch has, which then has one in each.
 
     Returns:
         One a job. What a job raises is raised, once all threads have come to their end.
@@ -74,6 +76,8 @@ def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) ->
         import torch
 
         workers = torch.get_num_threads()
+        with one_torch_thread():
+            return side_by_side(jobs, workers)
     workers = min(workers, len(jobs))
     if workers < 2:
         return [job() for job in jobs]

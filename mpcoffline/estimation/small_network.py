@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import torch
 from numpy.typing import NDArray
 
 from mpcoffline.core.threads import at_leisure
@@ -169,9 +169,9 @@ def _descended(
         rows = rng.permutation(len(data[0]))[: effort.rows]
         batch = data[0][rows], data[1][rows], data[2][rows]
         curvature, slope, error = _normal_equations(_layers(p, shapes), *batch)
-        slope -= decay * p
+        slope, diagonal = slope - decay * p, np.diag(curvature).astype(np.float64)
         for _ in range(_ATTEMPTS):
-            step = _solved(curvature, damping * (np.diag(curvature) + decay) + decay, slope)
+            step = _solved(curvature, damping * (diagonal + decay) + decay, slope)
             trial = p if step is None else p + step
             if (
                 step is not None
@@ -187,16 +187,19 @@ def _descended(
     return _layers(best, shapes), least_error
 
 
-def _solved(curvature: Array, diagonal: Array, slope: Array) -> Array | None:
-    """The step ``(curvature + diag(diagonal))^-1 slope``; None where rounding has left the sum without a root."""
-    matrix = curvature.copy()
-    np.fill_diagonal(matrix, np.diag(curvature) + diagonal)
-    try:
-        root = np.linalg.cholesky(matrix)  # scipy's holds the interpreter lock, and other members of an ensemble wait
-    except np.linalg.LinAlgError:
+def _solved(curvature: Single, diagonal: Array, slope: Array) -> Array | None:
+    """The step ``(curvature + diag(diagonal))^-1 slope``; None where rounding has left the sum without a root.
+
+    A step is a trial, so single precision is enough. At these sizes torch's factor takes a fifth of numpy's time, and
+    other members of an ensemble go on meanwhile, for which scipy's would not let go of the interpreter.
+    """
+    matrix = torch.from_numpy(curvature.copy())
+    matrix.diagonal().add_(torch.from_numpy(diagonal))
+    root, failed = torch.linalg.cholesky_ex(matrix)
+    if failed:
         return None
-    half = scipy.linalg.solve_triangular(root, slope, lower=True, check_finite=False)
-    return np.asarray(scipy.linalg.solve_triangular(root, half, lower=True, trans="T", check_finite=False))
+    step = torch.cholesky_solve(torch.from_numpy(slope.astype(np.float32))[:, None], root)
+    return np.asarray(step[:, 0].numpy(), dtype=np.float64)
 
 
 def _layers(flat: Array, shapes: list[tuple[int, ...]]) -> Layers:
@@ -220,7 +223,7 @@ def _error(layers: Layers, z: Array, unit: Array, targets: Array) -> float:
     return float(np.sum((unit * _signals(layers, z)[0][-1] - targets) ** 2) / len(z))
 
 
-def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array) -> tuple[Array, Array, float]:
+def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array) -> tuple[Single, Array, float]:
     """J'J, on and below its diagonal, J'(targets - y), and the squared error, per row.
 
     A layer's part of a row of J is an outer product, of what back-propagation gives for an output o and the layer's
@@ -234,60 +237,60 @@ def _normal_equations(layers: Layers, z: Array, unit: Array, targets: Array) -> 
     signals, slopes = _signals(layers, z)
     n, single = len(z), np.float32
     missed, last = targets - unit * signals[-1], unit * slopes[2]
-    A_1, A_2, s_0, s_1 = (v.astype(single) for v in (layers[1][:, :-1], layers[2][:, :-1], slopes[0], slopes[1]))
-    v = [np.hstack([signal, np.ones((n, 1))], dtype=single) for signal in signals[:3]]
-    out: Single = last.astype(single)
-    second_second = (out**2 @ _pairs(A_2, A_2)).reshape(n, len(A_1), -1) * _outer(s_1, s_1)
-    half = (second_second.reshape(-1, len(A_1)) @ A_1).reshape(n, len(A_1), -1)
-    second_first, turned = half * s_0[:, None, :], np.ascontiguousarray(half.transpose(0, 2, 1))
-    first_first = (turned.reshape(-1, len(A_1)) @ A_1).reshape(n, s_0.shape[1], -1) * _outer(s_0, s_0)
-    second = out[:, :, None] * A_2 * s_1[:, None, :]
-    first = (second.reshape(-1, len(A_1)) @ A_1).reshape(n, -1, s_0.shape[1]) * s_0[:, None, :]
+    A_1, A_2 = (layer[:, :-1].astype(single) for layer in layers[1:])
+    # Rows come last: then every product below is one of whole lines.
+    v = [np.vstack([signal.T, np.ones(n)], dtype=single) for signal in signals[:3]]
+    out, s_0, s_1 = (np.ascontiguousarray(each.T, dtype=single) for each in (last, slopes[0], slopes[1]))
+    size_1, size_2 = len(A_1), len(out)
+    second_second = (_pairs(A_2.T, A_2.T) @ out**2).reshape(size_1, size_1, n) * s_1[:, None] * s_1
+    first_second = _through(A_1, second_second) * s_0[:, None]
+    second_first = np.ascontiguousarray(first_second.transpose(1, 0, 2))
+    first_first = _through(A_1, second_first) * s_0[:, None]
+    second = A_2.T[:, :, None] * out * s_1[:, None]
+    first = _through(A_1, second) * s_0[:, None]
     below = {
         (0, 0): _symmetric_sums(first_first, v[0]),
         (1, 0): _sums(second_first, v[1], v[0]),
         (1, 1): _symmetric_sums(second_second, v[1]),
-        (2, 0): _sums(out[:, :, None] * first, v[2], v[0]),
-        (2, 1): _sums(out[:, :, None] * second, v[2], v[1]),
+        (2, 0): _sums((first * out).transpose(1, 0, 2), v[2], v[0]),
+        (2, 1): _sums((second * out).transpose(1, 0, 2), v[2], v[1]),
     }
     ends = np.cumsum([0, *(M.size for M in layers)])
     parts = [slice(ends[k], ends[k + 1]) for k in range(3)]
-    curvature = np.zeros((ends[-1], ends[-1]))
+    curvature = np.zeros((ends[-1], ends[-1]), dtype=single)
     for (i, k), block in below.items():
         np.divide(block, n, out=curvature[parts[i], parts[k]])
-    for o, block in enumerate(_sums((out**2)[:, :, None], v[2], v[2]).reshape(out.shape[1], v[2].shape[1], -1)):
+    for o, block in enumerate((out**2 @ _pairs(v[2], v[2]).T).reshape(size_2, len(v[2]), -1)):
         at = slice(ends[2] + o * len(block), ends[2] + (o + 1) * len(block))
         np.divide(block, n, out=curvature[at, at])
     pulled_2 = last * missed
     pulled_1 = (pulled_2 @ layers[2][:, :-1]) * slopes[1]
     pulled_0 = (pulled_1 @ layers[1][:, :-1]) * slopes[0]
-    slope = [(pulled.T @ signal).ravel() for pulled, signal in zip((pulled_0, pulled_1, pulled_2), v, strict=True)]
+    slope = [(signal @ pulled).T.ravel() for pulled, signal in zip((pulled_0, pulled_1, pulled_2), v, strict=True)]
     return curvature, np.concatenate(slope) / n, float(np.sum(missed**2) / n)
 
 
-def _outer(a: Single, b: Single) -> Single:
-    """Outer products of rows, ``(n, entries of a, of b)``."""
-    return np.asarray(a[:, :, None] * b[:, None, :])
+def _through(A: Single, d: Single) -> Single:
+    """``sum_a A_ab d_a..``: what back-propagation makes of the outputs of a matrix."""
+    return np.asarray((A.T @ d.reshape(len(d), -1)).reshape(A.shape[1], *d.shape[1:]))
 
 
 def _pairs(a: Single, b: Single) -> Single:
-    """The same, ``(n, entries of both)``."""
-    return _outer(a, b).reshape(len(a), -1)
+    """Products of each line of one and each of the other, ``(lines of a x lines of b, n)``."""
+    return np.asarray((a[:, None] * b).reshape(-1, a.shape[1]))
 
 
-def _sums(d: NDArray[Any], v: Single, w: Single) -> Single:
+def _sums(d: Single, v: Single, w: Single) -> Single:
     """``sum_rows d_ab v_c w_e`` as a matrix of rows (a, c) and columns (b, e)."""
-    summed = d.reshape(len(d), -1).T @ _pairs(v, w)
-    shape = *d.shape[1:], v.shape[1], w.shape[1]
-    return np.asarray(summed.reshape(shape).transpose(0, 2, 1, 3).reshape(shape[0] * shape[2], -1))
+    summed = d.reshape(-1, d.shape[2]) @ _pairs(v, w).T
+    return np.asarray(summed.reshape(*d.shape[:2], len(v), -1).transpose(0, 2, 1, 3).reshape(len(d) * len(v), -1))
 
 
-def _symmetric_sums(d: NDArray[Any], v: Single) -> Single:
+def _symmetric_sums(d: Single, v: Single) -> Single:
     """The same of symmetric d, and v twice: of the entries above the diagonals alone."""
-    (above_d, of_d), (above_v, of_v) = (_above(size) for size in (d.shape[1], v.shape[1]))
-    summed = d[:, above_d[0], above_d[1]].T @ (v[:, above_v[0]] * v[:, above_v[1]])
-    whole, size = summed[of_d][:, of_v], d.shape[1] * v.shape[1]
-    return np.asarray(whole.reshape(d.shape[1], d.shape[1], v.shape[1], -1).transpose(0, 2, 1, 3).reshape(size, size))
+    (above_d, of_d), (above_v, of_v) = (_above(len(each)) for each in (d, v))
+    whole, size = (d[above_d] @ (v[above_v[0]] * v[above_v[1]]).T)[of_d][:, of_v], len(d) * len(v)
+    return np.asarray(whole.reshape(len(d), len(d), len(v), -1).transpose(0, 2, 1, 3).reshape(size, size))
 
 
 def _above(size: int) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.intp]]:

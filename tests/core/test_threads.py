@@ -11,7 +11,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mpcoffline.core.threads import one_blas_thread, one_torch_thread, side_by_side
+from mpcoffline.core.threads import at_leisure, one_blas_thread, one_torch_thread, side_by_side
 
 
 @pytest.fixture
@@ -81,4 +81,8 @@ def test_whoever_asks_takes_part() -> None:
 def test_torch_has_one_thread_inside_and_as_many_as_before_outside() -> None:
     with one_torch_thread():
         assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+    assert side_by_side([torch.get_num_threads] * 3) == [1, 1, 1]
+    assert list(at_leisure([torch.get_num_threads] * 3)) == [1, 1, 1]
+    assert list(at_leisure([torch.get_num_threads])) == [1]
     assert torch.get_num_threads() == 2

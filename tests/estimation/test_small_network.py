@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mpcoffline.estimation.small_network import _normal_equations
+from mpcoffline.estimation.small_network import _normal_equations, _solved
 from mpcoffline.mpc.networks import random_layers
 
 
@@ -35,3 +35,13 @@ def test_the_normal_equations_are_those_of_automatic_derivatives(sizes: tuple[in
     np.testing.assert_allclose(np.tril(curvature), np.tril(truth), rtol=0, atol=1e-6 * np.abs(truth).max())
     np.testing.assert_allclose(slope, J.T @ missed / len(z), rtol=0, atol=1e-6 * np.abs(J.T @ missed / len(z)).max())
     assert error == pytest.approx(missed @ missed / len(z))
+
+
+def test_a_step_is_that_of_the_damped_normal_equations() -> None:
+    rng = np.random.default_rng(1)
+    J, slope, damping = rng.standard_normal((60, 40)), rng.standard_normal(40), rng.uniform(0.1, 1.0, 40)
+    curvature = np.tril(J.T @ J).astype(np.float32)  # of which nothing above the diagonal is read
+    step = _solved(curvature, damping, slope)
+    assert step is not None
+    np.testing.assert_allclose(step, np.linalg.solve(J.T @ J + np.diag(damping), slope), rtol=0, atol=1e-5)
+    assert _solved(-curvature, damping, slope) is None
