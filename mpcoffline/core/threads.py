@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import TypeVar
+
+_TO_BEGIN = 1e-3  # s that the begin and the end of other threads take
+_WORTH = 3e-3  # s of work, for which one more thread is begun
 
 T = TypeVar("T")
 
@@ -93,3 +99,24 @@ def side_by_side(jobs: Sequence[Callable[[], T]], workers: int | None = None) ->
         for other in others:
             other.result()
     return [done[i] for i in range(len(jobs))]
+
+
+class Crew:
+    """Threads that share batches of like problems: as many as pay, by how long a problem of the last batch took."""
+
+    def __init__(self) -> None:
+        self._pace = math.inf  # s of a thread for a problem
+
+    def share(self, work: Callable[[int, int], T], n_problems: int, most: int) -> list[T]:
+        """What each thread gives.
+
+        Args:
+            work: Does one of so many shares: is given its number and how many there are.
+            n_problems: Their number, at least 1.
+            most: Threads at most.
+        """
+        crew, begun = int(min(most, 1.0 + self._pace * n_problems / _WORTH)), time.perf_counter()
+        found = side_by_side([partial(work, first, crew) for first in range(crew)], crew)
+        lasted = time.perf_counter() - begun - (_TO_BEGIN if crew > 1 else 0.0)
+        self._pace = max(lasted, 0.0) * crew / n_problems
+        return found

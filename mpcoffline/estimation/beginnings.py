@@ -73,7 +73,7 @@ def applied_before(mpc: MPC, rows: TransitionTable, costs: Costs | None = None) 
         z = np.hstack([values.observations, np.where(unknown, layout.filled(applied), past)])
         found = (mpc.model(z, values.actions) - np.hstack([values.next_observations, z[:, mpc.ny :]]))[:, :n] / scale
         if priced is not None:
-            stage = mpc.stage_function(z.T, values.actions.T, mpc.theta).full()[0]
+            stage = mpc.stage_costs(z, values.actions)
             found = np.hstack([found, ((stage - priced[0]) / priced[1])[:, None]])
         return np.asarray(np.nan_to_num(found, nan=0.0, posinf=1e6, neginf=-1e6))
 

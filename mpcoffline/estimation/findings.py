@@ -183,4 +183,4 @@ def predicted(mpc: MPC, x: Array, u: Array) -> Array:
 def nominal_costs(mpc: MPC, z: Array, a: Array) -> Array:
     """The nominal stage cost of the MPC's states and inputs, ``(m,)``."""
     with np.errstate(all="ignore"):
-        return np.asarray(mpc.stage_function(z.T, a.T, mpc.theta).full().ravel())
+        return mpc.stage_costs(z, a)

@@ -95,6 +95,6 @@ def _limits(mpc: MPC) -> list[Constraint | StateBounds]:
 
 def _spread(mpc: MPC, observations: Array, actions: Array) -> float:
     """How much the stage cost varies over some rows; 1 where it does not."""
-    found = mpc.stage_function(mpc.state(observations).T, actions.T, mpc.theta).full()
+    found = mpc.stage_costs(mpc.state(observations), actions)
     spread = float(found[np.isfinite(found)].std()) if np.isfinite(found).any() else 0.0
     return spread if spread > 0.0 else 1.0

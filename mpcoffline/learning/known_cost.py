@@ -157,7 +157,7 @@ def _costs(mpc: MPC, table: TransitionTable, reached: bool = False) -> tuple[Arr
     columns, episodes = table.values(), np.asarray(table.episode_ids)
     going = np.flatnonzero(columns.terminations == 0.0)
     s, a = (columns.next_observations if reached else columns.observations)[going], columns.actions[going]
-    ours = mpc.stage_function(s.T, a.T, mpc.theta).full().ravel()
+    ours = mpc.stage_costs(s, a)
     pairs = np.flatnonzero((np.diff(going) == 1) & (np.diff(episodes[going]) == 0))
     return ours, np.asarray(columns.costs[going], dtype=np.float64), np.hstack([s, a]), pairs
 
@@ -230,7 +230,7 @@ def as_applied(mpc: MPC, table: TransitionTable, cost: KnownCost | None) -> NDAr
     agreeing = []
     for start in range(0, len(table), _CHUNK):
         rows = table.take(slice(start, start + _CHUNK)).values()
-        ours = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full().ravel()
+        ours = mpc.stage_costs(rows.observations, rows.actions)
         agreeing.append(np.abs(rows.costs - cost.scale * ours - cost.offset) <= cost.tolerance)
     return np.concatenate(agreeing)
 

@@ -116,7 +116,7 @@ class KnownCost:
     def stage_costs(self, mpc: MPC, columns: Columns) -> Array:
         """Lhat of transitions, ``(n,)``: of the states that the logged costs are of."""
         s = columns.next_observations if self.reached else columns.observations
-        return np.asarray(mpc.stage_function(s.T, columns.actions.T, mpc.theta).full().ravel())
+        return mpc.stage_costs(s, columns.actions)
 
     def of_state(self, mpc: MPC, s: Array) -> Array:
         """What T has to hold besides V at states ``(n, nx)``, ``(n,)``; zero where costs are of s.
@@ -127,8 +127,7 @@ class KnownCost:
         """
         if not self.reached:
             return np.zeros(len(s))
-        u = np.zeros((mpc.nu, len(s)))
-        return np.asarray(mpc.stage_function(s.T, u, mpc.theta).full().ravel())
+        return mpc.stage_costs(s, np.zeros((len(s), mpc.nu)))
 
     def __str__(self) -> str:
         """The relation, in words."""

@@ -247,8 +247,8 @@ class StateBounds(AnyConstraint):
             "kind": "StateBounds",
             "name": self.name,
             "soft": None if self.soft is None else list(self.soft),
-            "low": _finite_or_none(np.asarray(self.low)),
-            "high": _finite_or_none(np.asarray(self.high)),
+            "low": finite_or_none(np.asarray(self.low)),
+            "high": finite_or_none(np.asarray(self.high)),
             "at_end": self.at_end,
         }
 
@@ -386,5 +386,6 @@ def _checked_penalty(name: str, penalty: Penalty | None) -> Penalty | None:
     return weights
 
 
-def _finite_or_none(values: Array) -> list[float | None]:
+def finite_or_none(values: Array) -> list[float | None]:
+    """Numbers as JSON has them, which knows no infinity."""
     return [float(v) if np.isfinite(v) else None for v in values]

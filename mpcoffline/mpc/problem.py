@@ -26,6 +26,7 @@ from .constraints import (
     StateBounds,
     constraints_from_json,
     constraints_to_json,
+    finite_or_none,
     fitted_constraints,
 )
 from .expression_cost import cost_to_json
@@ -34,6 +35,7 @@ from .layout import Layout
 from .model import Model
 from .parameters import Group, ParameterSpace
 from .rest import at_rest, extreme_inputs
+from .row_twin import row_function
 from .seen import stage_expression, terminal_expression
 from .shown import html_of_mpc, text_of_mpc
 
@@ -95,10 +97,9 @@ class MPC:
         low, high = (self._bounds(name) for name in ("action_low", "action_high"))
         if not (low < high).all():
             raise InvalidArgumentError("action_low", expected=f"values below action_high = {high}", actual=str(low))
-        object.__setattr__(self, "horizon", int(self.horizon))
-        object.__setattr__(self, "discount", discount)
-        object.__setattr__(self, "action_low", low)
-        object.__setattr__(self, "action_high", high)
+        checked = {"horizon": int(self.horizon), "discount": discount, "action_low": low, "action_high": high}
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         if self.applied_before is not None:
             object.__setattr__(self, "applied_before", vector("applied_before", self.applied_before, self.nu))
         object.__setattr__(self, "constraints", fitted_constraints(self.constraints, _sizes(self.model)))
@@ -203,12 +204,11 @@ class MPC:
         memory = layout.filled(self.usual_input) if past is None else np.asarray(past, dtype=np.float64)
         if layout.signals and observations.shape[-1:] == (layout.n_states,):
             usual = np.broadcast_to(layout.usual_signals, (*observations.shape[:-1], layout.ny - layout.n_states))
-            observations = np.concatenate([observations, usual], axis=-1)
+            observations = np.concatenate([observations, usual], -1)
         for name, array, size in (("y", observations, layout.ny), ("past", memory, layout.n_memory)):
             if array.ndim < 1 or array.shape[-1] != size:
                 raise InvalidArgumentError(name, expected=f"shape (..., {size})", actual=f"shape {array.shape}")
-        memory = np.broadcast_to(memory, (*observations.shape[:-1], layout.n_memory))
-        return np.concatenate([observations, memory], axis=-1)
+        return np.concatenate([observations, np.broadcast_to(memory, (*observations.shape[:-1], layout.n_memory))], -1)
 
     def with_theta(self, theta: ArrayLike) -> MPC:
         """The same problem with other parameters, theta ``(space.size,)``.
@@ -285,14 +285,21 @@ class MPC:
         cost = scalar("stage_cost", lambda: stage_expression(self.layout, self.stage_cost, x, u, p), self.ny, self.nu)
         return traced("stage_cost", ca.Function("stage_cost", [x, u, theta], [cost], ["x", "u", "theta"], ["cost"]))
 
+    def stage_costs(self, x: Array, u: Array) -> Array:
+        """Lhat at states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``: many times as fast as one by one."""
+        return np.asarray(self._stage_rows(x, u, self.theta)[:, 0])
+
+    @cached_property
+    def _stage_rows(self) -> Callable[..., Array]:
+        return row_function(self.stage_function)
+
     @cached_property
     def terminal_function(self) -> ca.Function:
         """T_theta as CasADi function ``(x, theta) -> cost``."""
         x, _, theta = self._symbols()
         p = self.terminal_cost.space.symbols(self._part("terminal_cost", theta))
-        cost = scalar(
-            "terminal_cost", lambda: terminal_expression(self.layout, self.terminal_cost, x, p), self.ny, self.nu
-        )
+        layout, own = self.layout, self.terminal_cost
+        cost = scalar("terminal_cost", lambda: terminal_expression(layout, own, x, p), self.ny, self.nu)
         return traced("terminal_cost", ca.Function("terminal_cost", [x, theta], [cost], ["x", "theta"], ["cost"]))
 
     @cached_property
@@ -351,8 +358,8 @@ class MPC:
             "terminal_cost": cost_to_json(self.terminal_cost, self.layout, stage=False, portable=portable),
             "horizon": self.horizon,
             "discount": self.discount,
-            "action_low": [_finite_or_none(v) for v in np.asarray(self.action_low)],
-            "action_high": [_finite_or_none(v) for v in np.asarray(self.action_high)],
+            "action_low": finite_or_none(np.asarray(self.action_low)),
+            "action_high": finite_or_none(np.asarray(self.action_high)),
             "constraints": constraints_to_json(self._constraints, portable=portable) or None,
             **({} if self.applied_before is None else {"applied_before": np.asarray(self.applied_before).tolist()}),
         }
@@ -391,7 +398,3 @@ def _discount(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) <= 1.0:
         raise InvalidArgumentError("discount", expected="a number in (0, 1]", actual=repr(value))
     return float(value)
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

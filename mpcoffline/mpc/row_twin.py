@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import casadi as ca
 import numpy as np
 import torch
 
+from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.core.types import Array
 
 from .expressions import expanded
@@ -56,6 +60,18 @@ class RowTwin:
             some = (each[:, k : k + _CHUNK] if each.shape[1] == count else each for each in columns)
             found[:, k : k + _CHUNK] = self._twin(*some)
         return found.T.reshape(*shape, len(found))
+
+
+def row_function(function: ca.Function) -> Callable[..., Array]:
+    """The function at many rows: a :class:`RowTwin` where there can be one, else point by point as CasADi has it."""
+    try:
+        return RowTwin(function)
+    except InvalidArgumentError:
+        return partial(_by_casadi, function)
+
+
+def _by_casadi(function: ca.Function, *inputs: Array) -> Array:
+    return np.asarray(function(*(each.T for each in inputs)).full().T)
 
 
 def _columns(rows: Array, shape: tuple[int, ...]) -> Array:

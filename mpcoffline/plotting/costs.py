@@ -145,7 +145,7 @@ def _number(value: float, largest: float, *, exact: bool) -> str:
 
 def _stage_cost(mpc: MPC, y: Array) -> Array:
     """Lhat(y, 0) of observations ``(m, ny)``, ``(m,)``."""
-    return np.asarray(mpc.stage_function(mpc.state(y).T, np.zeros((mpc.nu, len(y))), mpc.theta).full()[0])
+    return mpc.stage_costs(mpc.state(y), np.zeros((len(y), mpc.nu)))
 
 
 def _entries(plant: Plant) -> list[str]:

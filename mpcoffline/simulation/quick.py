@@ -20,7 +20,7 @@ from mpcoffline.solvers.status import Status
 _SLOW = 10.0  # times as fast as ipopt
 _RETRIED = 0.1  # of the solves
 _NEAR, _ITERATIONS = 1e-8, 60  # tolerance and iterations of simulated solves; a plant's own are nearer to the minimum
-_FEW, _CARRIED = 20, 8  # iterations of solves from a plan, but of each eighth
+_FEW, _CARRIED = 10, 8  # iterations of solves from a plan, but of each eighth
 
 
 class RealTimeSolver(DDPSolver):

@@ -95,10 +95,7 @@ class Plan(tuple[Array, ...]):
 
     def _cheaper(self, mpc: MPC, rows: NDArray[np.intp], steps: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Whether steps cost less than the last ones."""
-        at, end = (
-            mpc.stage_function(self.x[rows, k].T, self.u[rows, i].T, mpc.theta).full()[0]
-            for k, i in ((steps, steps), (-1, -1))
-        )
+        at, end = (mpc.stage_costs(self.x[rows, k], self.u[rows, k]) for k in (steps, -1))
         return np.asarray(at < end)
 
     def rows(self, chosen: NDArray[Any]) -> Plan:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mpcoffline.core.threads import at_leisure, one_blas_thread, one_torch_thread, side_by_side
+from mpcoffline.core.threads import Crew, at_leisure, one_blas_thread, one_torch_thread, side_by_side
 
 
 @pytest.fixture
@@ -86,3 +86,25 @@ def test_torch_has_one_thread_inside_and_as_many_as_before_outside() -> None:
     assert list(at_leisure([torch.get_num_threads] * 3)) == [1, 1, 1]
     assert list(at_leisure([torch.get_num_threads])) == [1]
     assert torch.get_num_threads() == 2
+
+
+def test_a_crew_is_as_large_as_the_last_batch_was_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("mpcoffline.core.threads.time.perf_counter", lambda: now[0])
+    crew = Crew()
+
+    def shares(problem_takes: float, n_problems: int) -> int:
+        def work(number: int, count: int) -> tuple[int, int]:
+            if number == 0:  # all are at work at the same time
+                now[0] += problem_takes * n_problems / count
+            return number, count
+
+        done = crew.share(work, n_problems, most=4)
+        assert done == [(number, len(done)) for number in range(len(done))]
+        return len(done)
+
+    assert shares(1.0, 100) == 4  # nothing is known yet
+    assert shares(1e-6, 100) == 4  # as the last one took long
+    assert [shares(1e-6, 100), shares(1e-6, 100)] == [1, 1]
+    assert shares(1e-6, 5_000) == 2  # 5 ms
+    assert shares(1e-6, 1_000_000) == 4

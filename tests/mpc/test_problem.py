@@ -172,6 +172,7 @@ def test_stage_and_terminal_functions() -> None:
     x, u = np.array([1.0, -2.0]), np.array([0.5])
     stage = 0.7**2 + 0.1 * 4.0 + 0.2 * 0.25 + 0.7
     assert float(mpc.stage_function(x, u, mpc.theta)) == pytest.approx(stage, rel=1e-14)
+    np.testing.assert_allclose(mpc.stage_costs(np.array([x, 2.0 * x]), np.array([u, u]))[0], stage, rtol=1e-14)
     terminal = np.sqrt(0.7**2 + 4.0 + 0.01) - 0.1
     assert float(mpc.terminal_function(x, mpc.theta)) == pytest.approx(terminal, rel=1e-14)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
 from mpcoffline.mpc.numpy_twin import NumpyTwin
-from mpcoffline.mpc.row_twin import RowTwin
+from mpcoffline.mpc.row_twin import RowTwin, row_function
 from mpcoffline.mpc.torch_twin import TorchTwin
 
 Array = NDArray[np.float64]
@@ -66,3 +66,16 @@ def test_an_unknown_operation_is_refused() -> None:
     x = ca.SX.sym("x")
     with pytest.raises(InvalidArgumentError, match="operation"):
         RowTwin(ca.Function("f", [x], [ca.erfinv(x)]))
+
+
+def test_a_function_that_has_no_twin_is_evaluated_all_the_same() -> None:
+    x = ca.MX.sym("x", 2)
+    knots = [np.linspace(-1.0, 1.0, 5).tolist()]
+    spline = ca.interpolant("spline", "bspline", knots, (np.linspace(-1.0, 1.0, 5) ** 3).tolist())
+    function = ca.Function("own", [x], [ca.vertcat(spline(x[0]), x[1])])
+    rows = RNG.uniform(-1.0, 1.0, (20, 2))
+    evaluate = row_function(function)
+    assert not isinstance(evaluate, RowTwin)
+    np.testing.assert_allclose(evaluate(rows)[:, 0], rows[:, 0] ** 3, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(evaluate(rows)[:, 1], rows[:, 1])
+    assert isinstance(row_function(plain()), RowTwin)

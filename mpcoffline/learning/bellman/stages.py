@@ -323,9 +323,9 @@ def in_units_of(mpc: MPC, table: TransitionTable) -> MPC:
 
     (FIT) is drawn to theta_0, of which the ratios of the weights count, not their size.
     """
-    rows = table.sample(_SCALE_ROWS, 0)  # at random: a stride would meet the length of episodes
-    stage = mpc.stage_function(rows.observations.T, rows.actions.T, mpc.theta).full()
-    logged, nominal = float(rows.costs.std(dtype=np.float64)), float(stage.std())
+    rows = table.sample(_SCALE_ROWS, 0).values()  # at random: a stride would meet the length of episodes
+    stage = mpc.stage_costs(rows.observations, rows.actions)
+    logged, nominal = float(rows.costs.std()), float(stage.std())
     factor = logged / nominal if nominal > 0.0 else 1.0
     if not np.isfinite(factor) or factor == 0.0:
         return mpc

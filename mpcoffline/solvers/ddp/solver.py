@@ -5,14 +5,13 @@ from __future__ import annotations
 import ctypes
 import time
 from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpcoffline.core.errors import InvalidArgumentError
-from mpcoffline.core.threads import side_by_side
+from mpcoffline.core.threads import Crew
 from mpcoffline.core.types import Array
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.interface import SOLVERS, Solution, Solver
@@ -121,7 +120,7 @@ class DDPSolver(Solver):
         tolerance: Predicted decrease of the cost, relative to the magnitudes of its stages (their constants left out),
             below which a problem is solved; 1000 times as much where the iterations are used up.
         n_starts: Starting points of a cold solve; by default 16, and 1 where the problem is convex.
-        n_threads: Threads that share a batch; a batch of up to eight problems uses one.
+        n_threads: Threads that share a batch at most; small ones, of less than some ms, are one thread's.
         round_corners: Whether to round corners for what is not solved; exported C never does, nor is it done under
             limits.
 
@@ -180,7 +179,7 @@ class DDPSolver(Solver):
         self._candidates = np.ascontiguousarray(candidate_inputs(mpc)[:compared])
         self._starts = address(self._candidates), len(self._candidates), n_starts
         self.n_starts, self.max_iterations, self.tolerance = n_starts, max_iterations, tolerance
-        self._n_threads = n_threads
+        self._n_threads, self._crews = n_threads, (Crew(), Crew())  # for warm problems, for cold ones
         self._rounding: Rounding | None = None
         self._round_corners = bool(round_corners) and self._limited is None
 
@@ -374,19 +373,17 @@ class DDPSolver(Solver):
         return found
 
     def _call(self, batch: _Batch, *, cold: bool) -> int:
-        """Runs the kernel on a batch, in several threads if there are; returns how many failed."""
+        """Runs the kernel on a batch, in several threads where that pays; returns how many failed."""
         library, problem, arguments = self._library, ctypes.byref(self._problem), ctypes.byref(batch)
-        workers = min(self._n_threads, batch.n if cold else -(-batch.n // _LANES))
+        most = min(self._n_threads, batch.n if cold else -(-batch.n // _LANES))
 
-        def work(first: int) -> int:
+        def work(first: int, workers: int) -> int:
             if not cold:
                 return int(library.mpc_solve(problem, arguments, first, workers))
             return int(library.mpc_solve_cold(problem, arguments, *self._starts, first, workers))
 
-        if workers == 1:
-            return work(0)
         # ctypes releases the interpreter lock
-        return sum(side_by_side([partial(work, first) for first in range(workers)], workers))
+        return work(0, 1) if most < 2 else sum(self._crews[cold].share(work, batch.n, most))
 
 
 def _rows(theta: Array, chosen: NDArray[np.bool_]) -> Array:
