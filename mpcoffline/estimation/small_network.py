@@ -135,8 +135,10 @@ def fit_small_network(
     limit = np.maximum(_REACH * np.abs(data[1]).max(axis=0), np.finfo(np.float64).tiny)
     (z, open_), (z_stop, open_stop) = (gate.standardised(part[0]) for part in (data, stop))
     sizes = (z.shape[1], *hidden, data[1].shape[1])
-    batches, size = (z, open_[:, None] * limit, data[1]), float(np.mean(data[1] ** 2))
-    held_out = z_stop, open_stop[:, None] * limit, stop[1]
+    # Squares of targets in any unit are numbers of single precision; a power of two, so that it changes no bit.
+    unit = np.exp2(np.floor(np.log2(limit.max())))
+    batches = z, open_[:, None] * (limit / unit), data[1] / unit
+    held_out, size = (z_stop, open_stop[:, None] * (limit / unit), stop[1] / unit), float(np.mean(batches[2] ** 2))
 
     def descended(decay: float) -> tuple[Layers, float]:
         return _descended(sizes, batches, held_out, decay * size, np.random.default_rng(seed), effort)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mpcoffline.estimation.small_network import _normal_equations, _solved
+from mpcoffline.estimation.small_network import Effort, SmallNetwork, _normal_equations, _solved, fit_small_network
 from mpcoffline.mpc.networks import random_layers
 
 
@@ -45,3 +45,19 @@ def test_a_step_is_that_of_the_damped_normal_equations() -> None:
     assert step is not None
     np.testing.assert_allclose(step, np.linalg.solve(J.T @ J + np.diag(damping), slope), rtol=0, atol=1e-5)
     assert _solved(-curvature, damping, slope) is None
+
+
+@pytest.mark.parametrize("unit", [2.0**-140, 2.0**140])
+def test_targets_may_be_in_any_unit(unit: float) -> None:
+    """Their squares are beyond single precision."""
+    rng = np.random.default_rng(2)
+    inputs = rng.standard_normal((300, 2))
+    targets = np.sin(2.0 * inputs[:, :1]) * inputs[:, 1:]
+
+    def fitted(size: float) -> SmallNetwork:
+        data, stop = ((inputs[part], size * targets[part]) for part in (slice(200), slice(200, 300)))
+        return fit_small_network(data, stop, (6, 6), 0, Effort(rows=200, steps=15, decays=(1e-4,)))
+
+    found, other = fitted(1.0)(inputs), fitted(unit)(inputs)
+    assert np.mean((found - targets) ** 2) < 0.1 * np.var(targets)
+    np.testing.assert_allclose(other / unit, found, rtol=1e-12, atol=0)
