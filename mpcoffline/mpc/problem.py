@@ -286,7 +286,7 @@ class MPC:
         return traced("stage_cost", ca.Function("stage_cost", [x, u, theta], [cost], ["x", "u", "theta"], ["cost"]))
 
     def stage_costs(self, x: Array, u: Array) -> Array:
-        """Lhat at states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``: many times as fast as one by one."""
+        """Lhat at states ``(B, nx)`` and inputs ``(B, nu)``, ``(B,)``, undiscounted: faster than one by one."""
         return np.asarray(self._stage_rows(x, u, self.theta)[:, 0])
 
     @cached_property

@@ -63,7 +63,10 @@ class RowTwin:
 
 
 def row_function(function: ca.Function) -> Callable[..., Array]:
-    """The function at many rows: a :class:`RowTwin` where there can be one, else point by point as CasADi has it."""
+    """The function at many rows: a :class:`RowTwin` where there can be one, else point by point as CasADi has it.
+
+    Either takes rows ``(B, n_i)`` of each input, or ``(n_i,)`` for all, and gives its first output, ``(B, m)``.
+    """
     try:
         return RowTwin(function)
     except InvalidArgumentError:
