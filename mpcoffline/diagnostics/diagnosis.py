@@ -13,11 +13,11 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.threads import one_blas_thread
-from mpcoffline.datasets.table.memory import with_memory
+from mpcoffline.datasets.table.memory import gathered, with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, OutputIdentification
 from mpcoffline.estimation.plant import settled
-from mpcoffline.learner.candidates import FULL
+from mpcoffline.learner.candidates import FULL, whole_fit
 from mpcoffline.learner.learner import OfflineMPCLearner
 from mpcoffline.learning import ValueFunction
 from mpcoffline.learning.known_cost import as_logged, identify_as_logged
@@ -112,7 +112,8 @@ def diagnose(
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
     chosen = FULL if learner.candidates is None else learner.candidates.chosen
     policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
-    original, nominal = nominal, nominal.with_delay(learned.layout.delay)  # of the dead time that the learner has found
+    delay = whole_fit(learner).layout.delay  # which the learner has found; MPC_1, which it may hand out, knows of none
+    original, nominal, learned = nominal, nominal.with_delay(delay), learned.with_delay(delay)
     if isinstance(dataset, OutputIdentification):
         dataset = dataset.table
     logged = TransitionTable.of(dataset)
@@ -264,6 +265,9 @@ def _theorem(
     )
     if not aimed:
         return found
-    rest = settled(learned, table)
-    moduli = closed_loop_eigenvalues(learned, policy.solver, table, rest)
+    own = policy.mpc
+    if own.nx < learned.nx:  # MPC_1 knows no past inputs
+        table = gathered(table, learned.layout.places(own.layout))
+    rest = settled(own, table)
+    moduli = closed_loop_eigenvalues(own, policy.solver, table, rest)
     return replace(found, eigenvalues=moduli, leaves=moduli[:1] > (1.0,) and leaves_reference(policy, table, rest))

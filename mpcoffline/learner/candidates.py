@@ -175,6 +175,15 @@ class Candidates(Mapping[str, MPC]):
         return cls(mpcs, chosen, trials, tighter)
 
 
+def whole_fit(learner: OfflineMPCLearner) -> MPC:
+    """The MPC of the whole fit, whatever the learner hands out.
+
+    Raises:
+        MPCOfflineError: Before a fit.
+    """
+    return learner.mpc if learner.candidates is None else learner.candidates[FULL]
+
+
 def check_also(nominal: MPC, also: Mapping[str, MPC]) -> None:
     """Refuses further candidates that no other could be compared with.
 

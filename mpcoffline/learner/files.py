@@ -12,7 +12,7 @@ from mpcoffline.estimation import Sensors
 from mpcoffline.learning import METHODS, FitResult, ValueFunction
 from mpcoffline.mpc import MPC
 
-from .candidates import FULL, TRIALS, Candidates
+from .candidates import TRIALS, Candidates, whole_fit
 from .checkpoint import history_from_json
 from .softening import check_soften
 
@@ -44,7 +44,8 @@ def write_learner(learner: OfflineMPCLearner, path: str | PathLike[str]) -> None
         "candidates": None if learner.candidates is None else learner.candidates.to_json(),
         "observation_space": None if space is None else box_to_json(space),
     }
-    arrays = {} if learner.value_function is None else learner.value_function.to_arrays()
+    value = learner._given_value_function or learner.value_function
+    arrays = {} if value is None else value.to_arrays()
     if learner.candidates is not None:
         arrays |= learner.candidates.to_arrays()
     write_archive(path, "learner", document, arrays)
@@ -75,16 +76,16 @@ def read_learner(cls: type[OfflineMPCLearner], path: str | PathLike[str]) -> Off
             learner.sensors = Sensors.from_json(document["sensors"], nominal)
         if document["candidates"] is not None:
             learner.candidates = Candidates.from_files(document["candidates"], arrays)
+        whole = nominal if document["learned"] is None else whole_fit(learner)
         if document["result"] is not None:
-            whole = learner.mpc if learner.candidates is None else learner.candidates[FULL]
             learner.result = FitResult.from_json(document["result"], whole.theta)
         if document["observation_space"] is not None:
             learner._observation_space = box_from_json(document["observation_space"])
         arrays = {name: array for name, array in arrays.items() if not name.startswith(TRIALS)}
         if arrays:
-            learner.value_function = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
-            if document["value_given"]:
-                learner._given_value_function = learner.value_function
-            if learner.value_function.ny not in (nominal.nx, (learner.mpc if document["learned"] else nominal).nx):
+            value = ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
+            if value.ny not in (nominal.nx, whole.nx):
                 raise FileFormatError("value function", expected="the MPC's coordinates", actual="others")
+            learner._given_value_function = value if document["value_given"] else None
+            learner.value_function = value.of_layout(nominal.layout, whole.layout)
     return learner

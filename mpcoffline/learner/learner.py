@@ -98,7 +98,7 @@ class OfflineMPCLearner:
         value: Name of a value method, ``"residual"``, ``"td"``, ``"expectile"``, ``"iql"``, ``"auto"`` or another in
             ``mpcoffline.learning.VALUE_METHODS``, or a method itself; overrides the preset.
         value_function: A V_phi learned before, of the same data and discount, and of the MPC's state; (VALUE) is
-            skipped, and no dead time is looked for.
+            skipped. A dead time that is found changes nothing of it; none is looked for where its class is your own.
         device: Torch device for (VALUE). A GPU pays with large minibatches (``value_batch_size`` of some thousands).
         **options: Any option of the method, e.g. ``discount=0.97``, ``prior=1e-2`` or ``tau=0.1``; what two stages
             have takes the name of the stage in front (``value_n_steps``, ``fit_n_steps``). ``learner.method.options``

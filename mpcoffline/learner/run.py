@@ -95,6 +95,7 @@ class Run:
         """
         tell("looking at the data")
         known = self._prepared()
+        self.value_function = known.value_function
         stages, total = list(self.method.stages().items()), 0
         while stages:
             (name, stage), *stages = stages

@@ -168,6 +168,11 @@ class Layout:
         ages = [age for m in self.carried for age in range(1, m + 1)]
         return inputs, np.array(ages, dtype=np.intp)
 
+    def places(self, other: Layout) -> NDArray[np.intp]:
+        """Where in z what another layout's z holds stands, ``(other.nx,)``: one of as much memory, or less."""
+        memory = [self._place(int(i), int(age)) for i, age in zip(*other.ages, strict=True)]
+        return np.array([*range(self.ny), *memory], dtype=np.intp)
+
     def _place(self, i: int, age: int) -> int:
         """Where the value of input i of that many steps ago stands in [z, u]."""
         return self.nx + i if age == 0 else self.ny + sum(self.carried[:i]) + age - 1

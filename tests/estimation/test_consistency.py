@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from late_plants import belt_log, belt_mpc
 from numpy.typing import NDArray
 
 import mpcoffline
@@ -217,6 +218,12 @@ def test_a_certain_contradiction_is_an_error(name: str, with_ids: bool) -> None:
 def test_a_dead_time_longer_than_the_episodes_is_an_error() -> None:
     report = mpcoffline.check(arm_mpc(delay=STEPS + 3), LOG.table())
     assert report.errors[0].expected.startswith(f"more than {STEPS + 3} consecutive rows")
+
+
+@pytest.mark.parametrize("delay", [1, 3, 7])
+def test_a_dead_time_is_no_other_unit(delay: int) -> None:
+    """With inputs in another one the belt's errors would be twice 2 pi in all rows: the belt is no angle."""
+    assert not any("converted" in each.actual for each in mpcoffline.check(belt_mpc(), belt_log(delay)).findings)
 
 
 @pytest.mark.parametrize("delay", [0, 2])

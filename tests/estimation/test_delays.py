@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -11,8 +12,9 @@ import pytest
 from late_plants import belt_log, belt_mpc, pair_log, pair_mpc
 
 from mpcoffline import MPC, Model, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable
+from mpcoffline.diagnostics import diagnose
 from mpcoffline.estimation import find_delays, identify
-from mpcoffline.learning import Bellman, ParameterConfig, StartConfig, ValueConfig
+from mpcoffline.learning import Bellman, ParameterConfig, StartConfig, ValueConfig, ValueFunction, fit_value
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3, 7])
@@ -91,11 +93,11 @@ def test_what_is_identified_is_the_plant_itself() -> None:
         assert found.table.ny == 4
 
 
-def quick(mpc: MPC, **options: Any) -> OfflineMPCLearner:
+def quick(mpc: MPC, value_function: ValueFunction | None = None, **options: Any) -> OfflineMPCLearner:
     identify = StartConfig("identified", adapt_above=1.0, **options)
     fit = ParameterConfig(n_steps=1, refit_rows=500, refit_iterations=5)
     method = Bellman(identify=identify, value=ValueConfig(n_steps=5), fit=fit)
-    return OfflineMPCLearner(mpc, "cost+model", method=method)
+    return OfflineMPCLearner(mpc, "cost+model", method=method, value_function=value_function)
 
 
 def test_the_learner_finds_it_and_its_policy_carries_it(caplog: pytest.LogCaptureFixture) -> None:
@@ -111,6 +113,37 @@ def test_the_learner_finds_it_and_its_policy_carries_it(caplog: pytest.LogCaptur
     assert learner.nominal_mpc.model.delay is None
     _, state = learner.policy.predict(np.array([2.0]))
     assert state[2].shape == (1, 3)
+
+
+def test_a_value_function_that_was_given_stays_as_it_is(tmp_path: Path) -> None:
+    log, grid = belt_log(3), np.linspace(0.0, 5.0, 9)[:, None]
+    value = fit_value(log, belt_mpc().discount, ValueConfig(n_steps=5), seed=0)
+    learner = quick(belt_mpc(), value_function=value)
+    learner.fit(log, show_progress=False)
+    assert learner.mpc.model.delay == (3,)
+    learner.save(tmp_path / "learner.zip")
+    for each in (learner, OfflineMPCLearner.load(tmp_path / "learner.zip")):
+        assert each.value_function is not None
+        past = np.random.default_rng(0).random((9, 3))
+        np.testing.assert_allclose(each.value_function.predict(np.hstack([grid, past])), value.predict(grid), rtol=1e-6)
+    again = OfflineMPCLearner.load(tmp_path / "learner.zip")
+    again.fit(log, show_progress=False)
+    np.testing.assert_array_equal(again.theta, learner.theta)
+
+
+def test_mpc_1_handed_out_knows_no_past_inputs(tmp_path: Path) -> None:
+    """V is of a state that it has not; file and report are complete all the same."""
+    log = belt_log(3)
+    learner = quick(belt_mpc())
+    learner.candidate = "MPC_1"
+    learner.fit(log, show_progress=False)
+    assert (learner.mpc.nx, learner.value_function and learner.value_function.ny) == (1, 4)
+    learner.save(tmp_path / "learner.zip")
+    loaded = OfflineMPCLearner.load(tmp_path / "learner.zip")
+    report = diagnose(loaded, log, n_starts=4, n_steps=20)
+    assert report.verdict == "keep MPC_1"
+    slope = (loaded.policy.predict(np.array([3.1]))[0] - loaded.policy.predict(np.array([2.9]))[0]) / 0.2
+    np.testing.assert_allclose(report.theorem.eigenvalues, np.abs(0.8 + 0.7 * slope), atol=1e-3)  # its own model
 
 
 def test_a_delay_that_the_log_denies_is_kept_and_told(caplog: pytest.LogCaptureFixture) -> None:

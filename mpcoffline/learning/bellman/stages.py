@@ -69,24 +69,32 @@ class StartConfig:
 
 def with_dead_time(known: Known, config: StartConfig) -> Known:
     """The MPC with the dead time that the log shows, where its model says none; where it does, a check of that."""
-    if config.init == "nominal" or not config.delays or known.value_function is not None:
+    if config.init == "nominal" or not _looks_for_dead_time(known, config):
         return known
     model, search = known.mpc.model, find_delays(known.mpc, known.table, seed=known.seed)
     if not search.found:
         _log.info("Inputs: %s", search)
     elif model.delay is None:
         _log.warning("Inputs act late: found a %s. The learned MPC carries the past inputs.", search)
-        return replace(known, mpc=known.mpc.with_delay(search.delay))
+        mpc, value = known.mpc.with_delay(search.delay), known.value_function
+        if value is not None:
+            value = value.of_layout(known.mpc.layout, mpc.layout)
+        return replace(known, mpc=mpc, value_function=value)
     else:
         _log.warning("The model's delay is %s, the log says otherwise: a %s.", list(model.delay), search)
     return known
+
+
+def _looks_for_dead_time(known: Known, config: StartConfig) -> bool:
+    """It is where it may be, unless a V was given that only whoever wrote its class could extend by past inputs."""
+    return config.delays and (known.value_function is None or type(known.value_function) is ValueFunction)
 
 
 def identified(known: Known, config: StartConfig) -> Known:
     """The table without measurement noise, and the model, where it is learned, by its prediction error."""
     if config.init == "nominal":
         return known
-    tried = ["dead times"] if config.delays and known.value_function is None else []
+    tried = ["dead times"] if _looks_for_dead_time(known, config) else []
     rows = as_logged(known.mpc, known.table, known.cost)
     found, table = identify_as_logged(known.mpc, known.table, rows, tried=tried, seed=known.seed, start=known.start)
     if known.shards is not None and not found.noise.negligible and found.noise.source != "unknown":

@@ -15,6 +15,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.datasets.table.math import split
 from mpcoffline.datasets.table.shards import ShardedTable
 from mpcoffline.datasets.table.transitions import TransitionTable
+from mpcoffline.mpc.layout import Layout
 
 #: Variation below this share of a column's largest magnitude is rounding of float32 numbers.
 _ROUNDING = 1e-6
@@ -108,6 +109,25 @@ class ValueFunction(nn.Module):
         with torch.no_grad():
             values: Tensor = self(torch.from_numpy(array).to(self.mean.device))
         return np.asarray(values.cpu().numpy(), dtype=np.float64)
+
+    def of_layout(self, own: Layout, other: Layout) -> ValueFunction:
+        """The same function of a state that holds more past inputs, of which it asks none.
+
+        Args:
+            own: What its state is made of.
+            other: With as much memory, or more.
+
+        Returns:
+            Itself, where it is a function of that state.
+        """
+        if self.ny == other.nx:
+            return self
+        places, arrays = other.places(own), self.to_arrays()
+        for name, array in arrays.items():
+            if name in ("mean", "std") or name.endswith(".0.weight"):  # of the coordinates, or of a first layer
+                arrays[name] = np.full((*array.shape[:-1], other.nx), float(name == "std"), dtype=array.dtype)
+                arrays[name][..., places] = array
+        return ValueFunction.from_arrays(arrays).eval().requires_grad_(False)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All weights and normalisation constants as numpy arrays, by name."""

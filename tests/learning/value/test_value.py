@@ -15,6 +15,7 @@ from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, MPCOff
 from mpcoffline.datasets import TransitionTable
 from mpcoffline.learning import VALUE_METHODS, ValueConfig, ValueFunction, ValueTraining, fit_value
 from mpcoffline.learning.value.fit import Expectile, Residual, TemporalDifference, ValueMethod
+from mpcoffline.mpc.layout import Layout
 
 Array = NDArray[np.float64]
 GRID = np.stack(np.meshgrid(np.linspace(-0.8, 0.8, 17), np.linspace(-0.8, 0.8, 17)), axis=-1).reshape(-1, 2)
@@ -255,3 +256,25 @@ def test_bad_configurations_are_refused(options: dict[str, Any], message: str) -
     with pytest.raises(MPCOfflineError, match=message) as caught:
         ValueConfig(**options)
     assert isinstance(caught.value, UnknownIdError if "method" in options else InvalidArgumentError)
+
+
+@pytest.mark.parametrize("hidden", [(), (5,), (4, 3)])
+@pytest.mark.parametrize("n_members", [1, 2])
+def test_of_a_longer_memory_it_asks_what_it_knew(hidden: tuple[int, ...], n_members: int) -> None:
+    """Past inputs by input and age: those of the shorter memory decide, the others are anything."""
+    rng = np.random.default_rng(0)
+    short, long = Layout.of(2, 2, [1, 0]), Layout.of(2, 2, [3, 2])
+    y, past = rng.normal(size=(20, 2)), rng.normal(size=(20, 2, 3))  # of input 0 and 1, by age
+    value = ValueFunction(short.nx, hidden, n_members)
+    value.normalise(
+        TransitionTable.from_arrays(
+            *(rng.normal(size=(9, k)) for k in (3, 1)), np.arange(9.0), rng.normal(size=(9, 3)), np.zeros(9)
+        ),
+        0.9,
+    )
+    wide = value.of_layout(short, long)
+    z = np.column_stack([y, past[:, 0], past[:, 1, :2]])
+    np.testing.assert_allclose(wide.predict(z), value.predict(np.column_stack([y, past[:, 0, :1]])), rtol=1e-6)
+    assert wide.ny == long.nx
+    assert wide.discount == value.discount
+    assert value.of_layout(short, short) is value
