@@ -29,6 +29,7 @@ from .recording.recorder import MinariRecorder as MinariRecorder
 from .recording.rollouts import record as record
 from .store.local import list_datasets as list_datasets
 from .store.verification import VerifyReport as VerifyReport, verify as verify
-from .table.sharding import read_parquet as read_parquet, write_shards as write_shards
+from .table.parquet import parquet_sources as parquet_sources, read_parquet as read_parquet
+from .table.sharding import write_shards as write_shards
 from .table.shards import ShardedTable as ShardedTable
 from .table.transitions import TransitionTable as TransitionTable

@@ -1,15 +1,14 @@
-"""Writes shards: from tables, Minari data sets and Parquet files, one after another, in the memory of one of them."""
+"""Writes shards: from tables, Minari data sets and other files, one after another, in the memory of one of them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpcoffline.core.atomic import publish
 from mpcoffline.core.checks import check_integers
@@ -19,19 +18,20 @@ from mpcoffline.core.scratch import scratch_folder
 
 from .cache import TableFile, write_table
 from .math import CHUNK
-from .numbers import checked_episode_ids, floats
 from .shard_folders import NAMES
 from .transitions import TransitionTable
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
+    Source: TypeAlias = TransitionTable | MinariDataset | str
+
 SHARD_ROWS = 1 << 26  # some gigabytes: a process may have about a thousand files open, and has three of each shard
 
 
 def write_shards(
     folder: str | PathLike[str],
-    sources: Iterable[TransitionTable | MinariDataset | str],
+    sources: Iterable[Source | Callable[[], Source]],
     *,
     rows: int = SHARD_ROWS,
     ranks: Ranks | None = None,
@@ -44,12 +44,12 @@ def write_shards(
 
     Example:
         >>> write_shards("shards/", ["mine/plant-a-v0", "mine/plant-b-v0"])
-        >>> write_shards("shards/", (read_parquet(path, **columns) for path in paths))
+        >>> write_shards("shards/", parquet_sources("s3://plant/2026-*.parquet", **columns))
 
     Args:
         folder: Where to; made if it is not there.
-        sources: Tables, Minari data sets or their ids, all with the same columns. An iterator that makes each when it
-            is asked for keeps one at a time in memory.
+        sources: Tables, Minari data sets or their ids, all with the same columns; or functions that give one, which
+            are called one after the other, each by the process that packs what it gives.
         rows: The most rows of a shard.
         ranks: The processes of this job; those that ``torchrun`` started by default.
 
@@ -70,7 +70,7 @@ def write_shards(
     for number, source in enumerate(sources):
         if number % ranks.size != ranks.rank:
             continue
-        table = TransitionTable.of(source)
+        table = TransitionTable.of(source() if callable(source) else source)
         columns = (table.ny, table.nu, table.names)
         first = first or columns
         if columns != first:
@@ -117,62 +117,3 @@ def _write(target: Path, table: TransitionTable, part: slice) -> None:
             publish(building, target, overwrite=False)
     except OSError as error:
         raise error if isinstance(error, MPCOfflineError) else StorageError.of(target, error) from error
-
-
-def read_parquet(
-    path: str | PathLike[str],
-    *,
-    observations: Sequence[str],
-    actions: Sequence[str],
-    cost: str,
-    episode: str | None = None,
-    terminated: str | None = None,
-) -> TransitionTable:
-    """A table from a Parquet file that has a row for each step, in the order of time.
-
-    s+ is the s of the next row of the same episode; the last row of an episode, after which nothing is known, is left
-    out. For logs as historians write them (times, units, gaps) use :meth:`mpcoffline.Plant.read` instead.
-
-    Args:
-        path: The file, or an address that ``polars.read_parquet`` takes.
-        observations: Columns of s.
-        actions: Columns of a.
-        cost: Column of L(s, a).
-        episode: Column of whole numbers, of which each tells an episode; without, all rows are one.
-        terminated: Column that is true where the episode terminated in s+; without, nothing terminated.
-
-    Raises:
-        InvalidArgumentError: If polars is not installed.
-        InvalidDataError: For columns that are not there, or numbers that a table refuses.
-        StorageError: If it cannot be read.
-    """
-    try:
-        import polars
-    except ImportError as error:
-        hint = 'pip install "mpcoffline[logs]"'
-        raise InvalidArgumentError("read_parquet", expected="polars", actual="not installed", hint=hint) from error
-    name = str(path)
-    wanted = [*observations, *actions, cost, *(each for each in (episode, terminated) if each is not None)]
-    try:
-        frame = polars.read_parquet(str(path), columns=list(dict.fromkeys(wanted)))
-    except polars.exceptions.ColumnNotFoundError as error:
-        expected, actual = f"columns {', '.join(wanted)}", str(error).splitlines()[0]
-        raise InvalidDataError(name, expected=expected, actual=actual) from error
-    except (OSError, polars.exceptions.PolarsError) as error:
-        expected, actual = "to be read as Parquet", str(error).splitlines()[0]
-        raise StorageError(f"file {name}", expected=expected, actual=actual) from error
-
-    def numbers(columns: Iterable[str]) -> NDArray[Any]:
-        found = [floats(name, column, frame[column].to_numpy(), 1) for column in columns]
-        return np.stack(found, axis=1)
-
-    s, n = numbers(observations), len(frame)
-    ids = np.zeros(n, dtype=np.int64) if episode is None else frame[episode].to_numpy()
-    ids = checked_episode_ids(name, ids, n)
-    going = np.flatnonzero(ids[1:] == ids[:-1])
-    ended = np.zeros(n, dtype=bool) if terminated is None else frame[terminated].to_numpy()
-    table = TransitionTable.from_arrays(
-        s[going], numbers(actions)[going], numbers([cost])[going, 0], s[going + 1], ended[going], ids[going], name=name
-    )
-    table.names = (*observations, *actions)
-    return table

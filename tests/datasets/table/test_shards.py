@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,9 +11,15 @@ import lq_episodes
 import numpy as np
 import pytest
 
-from mpcoffline.core.errors import FileFormatError, InvalidArgumentError, InvalidDataError
+from mpcoffline.core.errors import (
+    FileFormatError,
+    InvalidArgumentError,
+    InvalidDataError,
+    MPCOfflineError,
+    StorageError,
+)
 from mpcoffline.core.ranks import Ranks
-from mpcoffline.datasets import ShardedTable, TransitionTable, read_parquet, write_shards
+from mpcoffline.datasets import ShardedTable, TransitionTable, parquet_sources, read_parquet, write_shards
 from mpcoffline.datasets.table.inside import Inside
 from mpcoffline.datasets.table.memory import remembering, with_memory
 from mpcoffline.mpc.layout import Layout
@@ -173,6 +180,50 @@ def test_parquet_files_become_transitions(tmp_path: Path) -> None:
     assert table.episode_ids.tolist() == [7, 7, 9]
     with pytest.raises(InvalidDataError, match="expected columns x, v"):
         read_parquet(tmp_path / "a.parquet", **(how | {"actions": ["v"]}))
+
+
+class Absent(Ranks):
+    """One of several processes, of which nobody waits for the others."""
+
+    def largest(self, numbers: Sequence[float]) -> list[float]:
+        """What it has itself."""
+        return list(numbers)
+
+
+def test_parquet_files_of_any_file_system_are_packed_by_whoever_has_them(tmp_path: Path) -> None:
+    polars, memory = pytest.importorskip("polars"), pytest.importorskip("fsspec").filesystem("memory")
+    for day in (2, 0, 1):
+        frame = polars.DataFrame({"x": [day + 0.0, day + 0.5, day + 1.0], "u": [0.0] * 3, "c": [1.0] * 3})
+        with memory.open(f"/plant/day-{day}.parquet", "wb") as file:
+            frame.write_parquet(file)
+    how = {"observations": ["x"], "actions": ["u"], "cost": "c"}
+    sources = parquet_sources("memory://plant/day-*.parquet", **how)
+    np.testing.assert_allclose([source().observations[0, 0] for source in sources], [0.0, 1.0, 2.0])
+    np.testing.assert_allclose(read_parquet("memory://plant/day-1.parquet", **how).observations[:, 0], [1.0, 1.5])
+
+    def asked(number: int) -> Callable[[], TransitionTable]:
+        return lambda: read.append(number) or sources[number]()  # type: ignore[func-returns-value]
+
+    read: list[int] = []
+    for rank in range(2):
+        write_shards(tmp_path, [asked(number) for number in range(3)], ranks=Absent(rank, 2))
+    assert read == [0, 2, 1]  # each by one process, in turns
+    assert len(ShardedTable.open(tmp_path, lanes=1)) == 6
+
+
+@pytest.mark.parametrize(
+    ("address", "error", "told"),
+    [
+        ("memory://nowhere/*.parquet", StorageError, "none"),
+        ("nonsense://plant/*.parquet", InvalidArgumentError, "nonsense"),
+    ],
+)
+def test_what_is_not_there_is_named(address: str, error: type[MPCOfflineError], told: str) -> None:
+    pytest.importorskip("fsspec")
+    with pytest.raises(error, match=told):
+        parquet_sources(address, observations=["x"], actions=["u"], cost="c")
+    with pytest.raises(error):
+        read_parquet(address, observations=["x"], actions=["u"], cost="c")
 
 
 def test_past_inputs_come_from_the_rows_before(folder: Path, whole: TransitionTable) -> None:
