@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from mpcoffline.core.errors import StorageError
-from mpcoffline.core.outputs import make_folder
+from mpcoffline.core.outputs import write_file
 from mpcoffline.mpc import MPC
 from mpcoffline.solvers.limits import Limits, limits_of
 
@@ -120,11 +121,12 @@ def save_functions(functions: Mapping[str, ca.Function], folder: str | PathLike[
         StorageError: If nothing could be written there.
     """
     paths = []
-    for name, function in functions.items():
-        path = make_folder(folder) / f"{name}.casadi"
-        try:
-            function.save(str(path))
-        except RuntimeError as error:
-            raise StorageError(str(path), expected="a file that can be written", actual=str(error)[:200]) from error
-        paths.append(path)
+    with TemporaryDirectory() as scratch:  # CasADi writes where it is told, a piece at a time
+        for name, function in functions.items():
+            path, made = Path(folder) / f"{name}.casadi", Path(scratch) / name
+            try:
+                function.save(str(made))
+            except RuntimeError as error:
+                raise StorageError(str(path), expected="a file that can be written", actual=str(error)[:200]) from error
+            paths.append(write_file(path, made.read_bytes()))
     return paths

@@ -189,6 +189,6 @@ def _library(sources: list[str]) -> dict[str, bytes]:
         if system and done.returncode == 0:
             machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(platform.machine(), platform.machine())
             return {f"binaries/{machine}-{system[0]}/{_NAME}{system[1]}": Path("library").read_bytes()}
-        said = f"{compiler}: {done.stderr.strip()[:200]}"
+        said = f"{compiler}: {done.stderr.strip()[:200] or f'exit code {done.returncode}'}"
     warn_once(f"{_FILE} has its sources alone, nothing compiled ({said}).")
     return {}

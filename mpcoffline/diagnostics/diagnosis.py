@@ -113,7 +113,8 @@ def diagnose(
     chosen = FULL if learner.candidates is None else learner.candidates.chosen
     policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
     delay = whole_fit(learner).layout.delay  # which the learner has found; MPC_1, which it may hand out, knows of none
-    original, nominal, learned = nominal, nominal.with_delay(delay), learned.with_delay(delay)
+    original, nominal = nominal, nominal.with_delay(delay)
+    learned = learned if learned.layout.delay == delay else learned.with_delay(delay)
     if isinstance(dataset, OutputIdentification):
         dataset = dataset.table
     logged = TransitionTable.of(dataset)

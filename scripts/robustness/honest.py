@@ -15,6 +15,7 @@ import numpy as np
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable, nominal_mpc
+from mpcoffline.control import distill
 from mpcoffline.datasets import dataset_from_arrays, load_dataset, record, repair
 from mpcoffline.datasets.store.packed import pack
 
@@ -29,8 +30,8 @@ class Honest:
     """A folder of honest files.
 
     Attributes:
-        folder: ``policy.zip``, ``learner.zip``, ``fit.ckpt``, ``packed.h5``, ``other/`` (files of the same kinds with
-            other content), ``store/`` (a Minari store), ``tables/`` and ``solvers/`` (caches).
+        folder: ``policy.zip``, ``distilled.zip``, ``learner.zip``, ``fit.ckpt``, ``packed.h5``, ``other/`` (files of
+            the same kinds with other content), ``store/`` (a Minari store), ``tables/`` and ``solvers/`` (caches).
         table: The rows of the data set.
         rows: The rows of the episodes in the logs, as bytes.
         foreign_rows: Those of the logs in ``other/``.
@@ -122,6 +123,9 @@ def make_honest(folder: Path) -> Honest:
         policy.predict(x)
         policy.save(folder / "policy.zip")
         MPCPolicy(small_mpc(2.0)).save(folder / "other" / "policy.zip")
+        starts = np.random.default_rng(0).uniform(-0.3, 0.3, (30, 3))
+        small = distill(policy, starts, seed=0, hidden=(4, 3), n_steps=6, n_labels=120, rounds=1, effort=0.05)
+        small.save(folder / "distilled.zip")
         fitted = learner()
         fitted.fit(table, show_progress=False)
         fitted.save(folder / "learner.zip")

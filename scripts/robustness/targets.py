@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mpcoffline import MPCPolicy, OfflineMPCLearner, TransitionTable
+from mpcoffline.control import DistilledPolicy
 from mpcoffline.datasets import load_dataset, repair, verify
 from mpcoffline.datasets.store.packed import packed_size, unpack
 
@@ -24,6 +25,7 @@ from .honest import LOGS, PACKED, SET, Honest, learner
 Read = Callable[[], str]
 FULL = {
     "policy/bytes": 700, "policy/zip": 300, "policy/json": 1300, "policy/arrays": 100,
+    "distilled/bytes": 300, "distilled/zip": 100, "distilled/json": 500, "distilled/arrays": 300,
     "learner/bytes": 400, "learner/zip": 100, "learner/json": 600, "learner/arrays": 300,
     "checkpoint/bytes": 400, "checkpoint/zip": 100, "checkpoint/json": 300, "checkpoint/arrays": 300,
     "metadata/bytes": 400, "metadata/json": 500, "metadata without sums/bytes": 300, "metadata without sums/json": 700,
@@ -39,8 +41,9 @@ COMPILE = 400  # s: a compiler may take its five minutes
 def all_cases(honest: Honest, share: float) -> list[Case]:
     """Every kind of file and mutation, numbered; the first numbers are the same for every share."""
     readers: dict[str, Callable[[Honest, str, Path, random.Random], tuple[str, Read]]] = {
-        "policy": archive, "learner": archive, "checkpoint": archive, "metadata": data_set, "hdf5": data_set,
-        "sums": data_set, "log": log, "table cache": table_cache, "compile cache": compile_cache, "packed": packed,
+        "policy": archive, "distilled": archive, "learner": archive, "checkpoint": archive,
+        "metadata": data_set, "hdf5": data_set, "sums": data_set, "log": log, "table cache": table_cache,
+        "compile cache": compile_cache, "packed": packed,
     }  # fmt: skip
     needs = {name: _need(partial(reader, honest, f"{name}/none")) for name, reader in readers.items()}
     cases = []
@@ -84,7 +87,7 @@ def _need(make: Callable[[Path, random.Random], tuple[str, Read]]) -> int:
 def archive(honest: Honest, kind: str, folder: Path, rng: random.Random) -> tuple[str, Read]:
     """A changed policy, learner or checkpoint."""
     target, way = kind.split("/")
-    name = {"policy": "policy.zip", "learner": "learner.zip", "checkpoint": "fit.ckpt"}[target]
+    name = "fit.ckpt" if target == "checkpoint" else f"{target}.zip"
     source, path = honest.folder / name, folder / name
     # Arrays are in a learner's file, and in the file of a policy with a network.
     found = mutations.members(source)
@@ -106,7 +109,9 @@ def archive(honest: Honest, kind: str, folder: Path, rng: random.Random) -> tupl
     else:
         what = "none"
         shutil.copy(source, path)
-    readers = {"policy": read_policy, "learner": read_learner, "checkpoint": read_checkpoint}
+    readers = {
+        "policy": read_policy, "distilled": read_distilled, "learner": read_learner, "checkpoint": read_checkpoint
+    }  # fmt: skip
     os.environ["MPCOFFLINE_CACHE"] = str(honest.folder / "solvers")
     return what, partial(readers[target], honest, path, way in ("json", "arrays"))
 
@@ -126,6 +131,36 @@ def read_policy(honest: Honest, path: Path, free: bool) -> str:
         raise Finding(WRONG, "another policy")
     act(policy)
     return EQUAL if same else OTHER
+
+
+def read_distilled(honest: Honest, path: Path, free: bool) -> str:
+    """Loads and acts; the honest one has three observations and one input."""
+    policy = DistilledPolicy.load(path)
+    LIMITS.begin("reference", 30)
+    found, wanted = map(distilled_fingerprint, (policy, DistilledPolicy.load(honest.folder / "distilled.zip")))
+    LIMITS.begin("predict", 10)
+    action, _ = policy.predict(np.zeros(policy.observation_space.shape))
+    low, high = policy.action_space.low, policy.action_space.high
+    if not (np.isfinite(action).all() and (action >= low).all() and (action <= high).all()):
+        raise Finding(WRONG, f"action {action}")
+    if found != wanted and not free:
+        raise Finding(WRONG, "another policy")
+    return EQUAL if found == wanted else OTHER
+
+
+def distilled_fingerprint(policy: DistilledPolicy) -> str:
+    """Everything that a distilled policy's file says."""
+    numbers = [
+        array.tolist() for array in (*policy.network.to_arrays().values(), policy.usual_memory, policy.memory_sources)
+    ]
+    names = [
+        policy.y_labels,
+        policy.u_labels,
+        policy.memory_names,
+        str(policy.observation_space),
+        str(policy.action_space),
+    ]
+    return json.dumps([numbers, names, policy.report.to_json()], sort_keys=True, default=str)
 
 
 def act(policy: MPCPolicy) -> None:

@@ -133,6 +133,18 @@ def test_without_a_compiler_it_has_sources(tmp_path: Path, monkeypatch: pytest.M
     assert "no C compiler" in warned[0]
 
 
+def test_a_compiler_that_never_ends_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler = tmp_path / "cc"
+    compiler.write_text("#!/bin/sh\nexec sleep 600\n")
+    compiler.chmod(0o755)
+    monkeypatch.setattr("mpcoffline.control.export_fmi.compilers", lambda: [str(compiler)])
+    monkeypatch.setattr("mpcoffline.control.export_fmi._SECONDS", 0.6)
+    warned: list[str] = []
+    monkeypatch.setattr("mpcoffline.control.export_fmi.warn_once", warned.append)
+    assert not (unpacked(problem(PENDULUM), tmp_path / "out") / "binaries").exists()
+    assert "no result within" in warned[0]
+
+
 def test_a_map_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgumentError, match=r"model: expected an ordinary differential.*discrete map of 0.1 s"):
         export_fmi(MPCPolicy(problem(LINEAR)), tmp_path)
