@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from mpcoffline.core.errors import InvalidArgumentError, InvalidDataError, Stora
 
 from .numbers import checked_episode_ids, floats
 from .transitions import TransitionTable
+
+if TYPE_CHECKING:
+    import polars
 
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)(::|://)", re.IGNORECASE)
 _OF_POLARS = ("s3", "s3a", "gs", "gcs", "az", "azure", "abfs", "abfss", "adl", "http", "https", "hf", "file")
@@ -48,14 +51,23 @@ def read_parquet(
         InvalidDataError: For columns that are not there, or numbers that a table refuses.
         StorageError: If it cannot be read.
     """
-    name, address, file = str(path), _ADDRESS.match(str(path)), None
-    if address is not None and not (address[2] == "://" and address[1].lower() in _OF_POLARS):
-        with _reading(name):
-            import fsspec
+    name = str(path)
+    frame = _frame(name, [*observations, *actions, cost, *(each for each in (episode, terminated) if each is not None)])
 
-            file = fsspec.open(name, "rb")
-    own = {"episode": episode, "terminated": terminated}
-    return _table(name, file, observations=observations, actions=actions, cost=cost, **own)
+    def numbers(columns: Iterable[str]) -> NDArray[Any]:
+        found = [floats(name, column, frame[column].to_numpy(), 1) for column in columns]
+        return np.stack(found, axis=1)
+
+    s, n = numbers(observations), len(frame)
+    ids = np.zeros(n, dtype=np.int64) if episode is None else frame[episode].to_numpy()
+    ids = checked_episode_ids(name, ids, n)
+    going = np.flatnonzero(ids[1:] == ids[:-1])
+    ended = np.zeros(n, dtype=bool) if terminated is None else frame[terminated].to_numpy()
+    table = TransitionTable.from_arrays(
+        s[going], numbers(actions)[going], numbers([cost])[going, 0], s[going + 1], ended[going], ids[going], name=name
+    )
+    table.names = (*observations, *actions)
+    return table
 
 
 def parquet_sources(paths: str | PathLike[str], **columns: Any) -> list[Callable[[], TransitionTable]]:
@@ -73,66 +85,54 @@ def parquet_sources(paths: str | PathLike[str], **columns: Any) -> list[Callable
         InvalidArgumentError: If fsspec does not know the file system, or what it needs is not installed.
         StorageError: If nobody can be asked, or no file is there.
     """
-    with _reading(str(paths)):
+    with _asking(str(paths)):
         import fsspec
 
-        files = {file.full_name: file for file in fsspec.open_files(str(paths), "rb")}
-    if not files:
+        names = [file.full_name for file in fsspec.open_files(str(paths), "rb")]
+    if not names:
         raise StorageError(f"files {paths}", expected="one at least", actual="none")
-    return [partial(_table, name, files[name], **columns) for name in sorted(files)]
+    _, chained, within = str(paths).partition("::")  # as of files in an archive
+    return [partial(read_parquet, f"{name}{chained}{within}", **columns) for name in sorted(names)]
 
 
-@contextmanager
-def _reading(name: str) -> Iterator[None]:
-    """Names what does not answer."""
-    try:
-        yield
-    except (ImportError, ValueError) as error:  # of the file system's package; of an unknown one
-        expected, hint = "a file system that can be read here", "fsspec's documentation says what each one needs."
-        raise InvalidArgumentError(f"address {name}", expected=expected, actual=str(error), hint=hint) from error
-    except OSError as error:
-        actual = str(error).partition("\n")[0] or type(error).__name__
-        raise StorageError(f"file {name}", expected="to be read", actual=actual) from error
-
-
-def _table(
-    name: str,
-    file: Any,
-    *,
-    observations: Sequence[str],
-    actions: Sequence[str],
-    cost: str,
-    episode: str | None = None,
-    terminated: str | None = None,
-) -> TransitionTable:
-    """See :func:`read_parquet`; ``file`` is what fsspec opens, or None where polars does."""
+def _frame(name: str, columns: list[str]) -> polars.DataFrame:
+    """Some columns of a file."""
     try:
         import polars
     except ImportError as error:
         hint = 'pip install "mpcoffline[logs]"'
         raise InvalidArgumentError("read_parquet", expected="polars", actual="not installed", hint=hint) from error
-    wanted = [*observations, *actions, cost, *(each for each in (episode, terminated) if each is not None)]
+    with ExitStack() as ending:
+        source = _source(name, ending)
+        try:
+            return polars.read_parquet(source, columns=list(dict.fromkeys(columns)))
+        except polars.exceptions.ColumnNotFoundError as error:
+            expected, actual = f"columns {', '.join(columns)}", str(error).splitlines()[0]
+            raise InvalidDataError(name, expected=expected, actual=actual) from error
+        except (OSError, polars.exceptions.PolarsError) as error:
+            expected, actual = "to be read as Parquet", str(error).splitlines()[0]
+            raise StorageError(f"file {name}", expected=expected, actual=actual) from error
+
+
+def _source(name: str, ending: ExitStack) -> Any:
+    """What polars takes: the name of what it finds by itself, else a file of fsspec, closed in the end."""
+    address = _ADDRESS.match(name)
+    if address is None or (address[2] == "://" and address[1].lower() in _OF_POLARS):
+        return name
+    with _asking(name):
+        import fsspec
+
+        return ending.enter_context(fsspec.open(name, "rb"))
+
+
+@contextmanager
+def _asking(name: str) -> Iterator[None]:
+    """Names a file system that does not answer; each has errors of its own."""
     try:
-        with _reading(name), nullcontext(name) if file is None else file as opened:
-            frame = polars.read_parquet(opened, columns=list(dict.fromkeys(wanted)))
-    except polars.exceptions.ColumnNotFoundError as error:
-        expected, actual = f"columns {', '.join(wanted)}", str(error).splitlines()[0]
-        raise InvalidDataError(name, expected=expected, actual=actual) from error
-    except polars.exceptions.PolarsError as error:
-        expected, actual = "to be read as Parquet", str(error).splitlines()[0]
-        raise StorageError(f"file {name}", expected=expected, actual=actual) from error
-
-    def numbers(columns: Iterable[str]) -> NDArray[Any]:
-        found = [floats(name, column, frame[column].to_numpy(), 1) for column in columns]
-        return np.stack(found, axis=1)
-
-    s, n = numbers(observations), len(frame)
-    ids = np.zeros(n, dtype=np.int64) if episode is None else frame[episode].to_numpy()
-    ids = checked_episode_ids(name, ids, n)
-    going = np.flatnonzero(ids[1:] == ids[:-1])
-    ended = np.zeros(n, dtype=bool) if terminated is None else frame[terminated].to_numpy()
-    table = TransitionTable.from_arrays(
-        s[going], numbers(actions)[going], numbers([cost])[going, 0], s[going + 1], ended[going], ids[going], name=name
-    )
-    table.names = (*observations, *actions)
-    return table
+        yield
+    except (ImportError, ValueError) as error:  # of its package; of one that fsspec does not know
+        expected, hint = "a file system that can be read here", "fsspec's documentation says what each one needs."
+        raise InvalidArgumentError(f"address {name}", expected=expected, actual=str(error), hint=hint) from error
+    except Exception as error:
+        actual = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise StorageError(f"file {name}", expected="to be read", actual=actual) from error

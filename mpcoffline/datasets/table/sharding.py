@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,14 +24,12 @@ from .transitions import TransitionTable
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-    Source: TypeAlias = TransitionTable | MinariDataset | str
-
 SHARD_ROWS = 1 << 26  # some gigabytes: a process may have about a thousand files open, and has three of each shard
 
 
 def write_shards(
     folder: str | PathLike[str],
-    sources: Iterable[Source | Callable[[], Source]],
+    sources: Iterable[TransitionTable | MinariDataset | str | Callable[[], TransitionTable | MinariDataset | str]],
     *,
     rows: int = SHARD_ROWS,
     ranks: Ranks | None = None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import zipfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -201,14 +202,19 @@ def test_parquet_files_of_any_file_system_are_packed_by_whoever_has_them(tmp_pat
     np.testing.assert_allclose([source().observations[0, 0] for source in sources], [0.0, 1.0, 2.0])
     np.testing.assert_allclose(read_parquet("memory://plant/day-1.parquet", **how).observations[:, 0], [1.0, 1.5])
 
+    with zipfile.ZipFile(tmp_path / "days.zip", "w") as archive:
+        archive.writestr("day-0.parquet", memory.cat("/plant/day-0.parquet"))
+    (source,) = parquet_sources(f"zip://*.parquet::file://{tmp_path}/days.zip", **how)
+    np.testing.assert_allclose(source().observations[:, 0], [0.0, 0.5])
+
     def asked(number: int) -> Callable[[], TransitionTable]:
         return lambda: read.append(number) or sources[number]()  # type: ignore[func-returns-value]
 
     read: list[int] = []
     for rank in range(2):
-        write_shards(tmp_path, [asked(number) for number in range(3)], ranks=Absent(rank, 2))
+        write_shards(tmp_path / "shards", [asked(number) for number in range(3)], ranks=Absent(rank, 2))
     assert read == [0, 2, 1]  # each by one process, in turns
-    assert len(ShardedTable.open(tmp_path, lanes=1)) == 6
+    assert len(ShardedTable.open(tmp_path / "shards", lanes=1)) == 6
 
 
 @pytest.mark.parametrize(
