@@ -12,12 +12,16 @@ from typing import Any
 import casadi as ca
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 import mpcoffline.envs  # noqa: F401 -- registers the environments
 from mpcoffline import MPC, Model, MPCPolicy, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable, nominal_mpc
-from mpcoffline.control import distill
+from mpcoffline.control import DistilledPolicy
+from mpcoffline.control.explicit.network import PolicyNetwork
+from mpcoffline.control.explicit.report import Comparison, DistillationReport
 from mpcoffline.datasets import dataset_from_arrays, load_dataset, record, repair
 from mpcoffline.datasets.store.packed import pack
+from mpcoffline.mpc.labels import Label
 
 ENV = "mpcoffline/LinearTracking-v0"
 SET, LOGS, PACKED = "aa/set-v0", "aa/logs-v0", "aa/packed-v0"
@@ -66,6 +70,20 @@ def small_mpc(mass: float = 1.0) -> MPC:
 
     model = Model(dynamics, 3, 1, 0.1, {"m": Parameter(mass, low=0.1, unit="kg")})
     return MPC(model, QuadraticCost(np.eye(3), [[0.1]]), QuadraticCost(np.eye(3)), 6, 0.95, [-1], [1])
+
+
+def small_distilled() -> DistilledPolicy:
+    """Random weights; one past input travels in its state."""
+    rng, seen, set_ = np.random.default_rng(0), spaces.Box(-np.inf, np.inf, (3,)), spaces.Box(-1.0, 1.0, (1,))
+    network = PolicyNetwork.random(
+        rng.normal(size=(20, 4)), (set_.low, set_.high), rng.normal(size=(20, 1)), (4, 3), rng
+    )
+    report = DistillationReport(
+        network.multiply_adds, 10, (0.1,), Comparison.of([1.0, 2.0], [1.0, 1.5], 10), None, 0.1, 0.95, 0
+    )
+    names = {"y_labels": [Label(f"x{i}", "m") for i in range(3)], "u_labels": [Label("u", "N")]}
+    memory = {"usual_memory": [0.0], "memory_sources": [1], "memory_names": ["u[k-1]"]}
+    return DistilledPolicy(network, seen, set_, **names, **memory, report=report)
 
 
 def learner() -> OfflineMPCLearner:
@@ -123,9 +141,7 @@ def make_honest(folder: Path) -> Honest:
         policy.predict(x)
         policy.save(folder / "policy.zip")
         MPCPolicy(small_mpc(2.0)).save(folder / "other" / "policy.zip")
-        starts = np.random.default_rng(0).uniform(-0.3, 0.3, (30, 3))
-        small = distill(policy, starts, seed=0, hidden=(4, 3), n_steps=6, n_labels=120, rounds=1, effort=0.05)
-        small.save(folder / "distilled.zip")
+        small_distilled().save(folder / "distilled.zip")
         fitted = learner()
         fitted.fit(table, show_progress=False)
         fitted.save(folder / "learner.zip")

@@ -116,7 +116,7 @@ def test_the_learner_finds_it_and_its_policy_carries_it(caplog: pytest.LogCaptur
 
 
 def test_a_value_function_that_was_given_stays_as_it_is(tmp_path: Path) -> None:
-    log, grid = belt_log(3), np.linspace(0.0, 5.0, 9)[:, None]
+    log, grid = belt_log(3, n_episodes=8), np.linspace(0.0, 5.0, 9)[:, None]
     value = fit_value(log, belt_mpc().discount, ValueConfig(n_steps=5), seed=0)
     learner = quick(belt_mpc(), value_function=value)
     learner.fit(log, show_progress=False)
@@ -133,7 +133,7 @@ def test_a_value_function_that_was_given_stays_as_it_is(tmp_path: Path) -> None:
 
 def test_mpc_1_handed_out_knows_no_past_inputs(tmp_path: Path) -> None:
     """V is of a state that it has not; file and report are complete all the same."""
-    log = belt_log(3)
+    log = belt_log(3, n_episodes=8)
     learner = quick(belt_mpc())
     learner.candidate = "MPC_1"
     learner.fit(log, show_progress=False)
