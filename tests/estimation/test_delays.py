@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from late_plants import belt_log, belt_mpc, pair_log, pair_mpc
 
-from mpcoffline import MPC, Model, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable
+from mpcoffline import MPC, InvalidArgumentError, Model, OfflineMPCLearner, Parameter, QuadraticCost, TransitionTable
 from mpcoffline.diagnostics import diagnose
 from mpcoffline.estimation import find_delays, identify
 from mpcoffline.learning import Bellman, ParameterConfig, StartConfig, ValueConfig, ValueFunction, fit_value
@@ -157,3 +157,15 @@ def test_the_search_can_be_left_out() -> None:
     learner = quick(belt_mpc(), delays=False)
     learner.fit(belt_log(3), show_progress=False)
     assert learner.mpc.layout.is_plain
+
+
+def test_a_value_function_learned_with_dead_time_goes_with_an_mpc_that_has_it() -> None:
+    log = belt_log(3, n_episodes=8)
+    learner = quick(belt_mpc())
+    learner.fit(log, show_progress=False)
+    with pytest.raises(InvalidArgumentError, match=r"of 1 coordinates, got 4.*with_delay"):
+        quick(belt_mpc(), value_function=learner.value_function)
+    again = quick(belt_mpc().with_delay(3), value_function=learner.value_function)
+    again.fit(log, show_progress=False)
+    assert again.value_function is learner.value_function
+    np.testing.assert_allclose(again.theta, learner.theta, rtol=1e-6)
