@@ -4,9 +4,9 @@ FOLDER/dist holds wheel and sdist. PYTHON is that of an environment with the dep
 that borrows those of the environment which runs this script by a path file, so that nothing is downloaded; the editable
 install there does not reach it, as path files do not nest. With PYTHON only what its versions decide is tried.
 
-Tried are: the contents of the sdist, the metadata as an index sees it, the import, the command line, the README's quick
-start (with a short regression, without the choice that follows), and scripts/users_script.py, which is run, and
-type-checked together with the quick start.
+Tried are: the contents of the sdist, the metadata as an index sees it, the import, the command line, and
+scripts/users_script.py, which is run, and type-checked together with the README's quick start. With PYTHON the quick
+start is run, too (with a short regression, without the choice that follows); without, the tests run it as well.
 """
 
 import os
@@ -118,7 +118,7 @@ def try_wheel(python: Path, folder: Path, *, types: bool) -> None:
     trial("wheel", python, "-c", TRIAL, packages_of(python).parents[2])
     for arguments in (["--version"], ["run", "--help"], ["datasets", "list"]):
         trial(f"mpcoffline {' '.join(arguments)}", python.parent / "mpcoffline", *arguments)
-    if not types:  # with the newest versions the suite runs it
+    if not types:  # else the tests run it with the same versions
         trial("quick start", python, "-c", RUN, "quick_start.py")
     trial("user's script", python, "-c", RUN, "users_script.py")
     if checked is not None:

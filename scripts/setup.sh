@@ -26,11 +26,15 @@ pip_into() {
     "$home/bin/python" -m pip install --disable-pip-version-check -q --no-compile "$@"
 }
 
-# install_into ENVIRONMENT ARGUMENTS...: the same by uv, which takes a tenth of the time; by pip, whose settings uv does
-# not know, where uv cannot be had or fails.
+# install_into ENVIRONMENT ARGUMENTS...: the same by uv, which takes a fraction of the time. By pip where uv cannot be had
+# or fails, and where pip was told of an index of its own, which uv would not ask.
 install_into() {
     local home="$1" python="$1/bin/python"
     shift
+    if "$python" -m pip config list 2>/dev/null | grep -Eq '\.(index-url|no-index)='; then
+        pip_into "$home" "$@"
+        return
+    fi
     "$python" -m uv --version >/dev/null 2>&1 || pip_into "$home" uv -c constraints.txt >/dev/null 2>&1 || true
     "$python" -m uv pip install -q --system-certs --python "$python" "$@" 2>/dev/null || pip_into "$home" "$@"
 }

@@ -13,7 +13,7 @@ from mpcoffline.control.policy import MPCPolicy
 from mpcoffline.core.checks import check_integers
 from mpcoffline.core.errors import MPCOfflineError
 from mpcoffline.core.threads import one_blas_thread
-from mpcoffline.datasets.table.memory import gathered, with_memory
+from mpcoffline.datasets.table.memory import with_memory
 from mpcoffline.datasets.table.transitions import TransitionTable
 from mpcoffline.estimation import Identification, OutputIdentification
 from mpcoffline.estimation.plant import settled
@@ -112,7 +112,9 @@ def diagnose(
         raise MPCOfflineError("learner", expected="a fitted learner", actual="no fit yet", hint="Call fit(dataset).")
     chosen = FULL if learner.candidates is None else learner.candidates.chosen
     policies = {FIRST: quick_policy(nominal), chosen: quick_policy(learned)}
-    delay = whole_fit(learner).layout.delay  # which the learner has found; MPC_1, which it may hand out, knows of none
+    delay = whole_fit(
+        learner
+    ).layout.delay  # which the learner has found; what it hands out may know of none, or another
     original, nominal = nominal, nominal.with_delay(delay)
     learned = learned if learned.layout.delay == delay else learned.with_delay(delay)
     if isinstance(dataset, OutputIdentification):
@@ -170,7 +172,7 @@ def diagnose(
         value=value_check(learner.value_function, priced, learned.discount),
         fit=fit_errors(nominal, learned, learner.value_function, plain, learner.result),
         prediction=_prediction(nominal, identified, learned, found),
-        theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second, aimed=aimed),
+        theorem=_theorem(learned, policies[chosen], learner.value_function, clean, second, logged, aimed=aimed),
         weights=weight_checks(nominal, learned, clean),
         at_bounds=bound_names(learned, nominal, clean),
         outside_support=outside_support(clean, predicted_states(learned, clean)),
@@ -256,6 +258,7 @@ def _theorem(
     value: ValueFunction,
     table: TransitionTable,
     simulation: Episodes,
+    logged: TransitionTable,
     *,
     aimed: bool,
 ) -> TheoremCheck:
@@ -267,8 +270,8 @@ def _theorem(
     if not aimed:
         return found
     own = policy.mpc
-    if own.nx < learned.nx:  # MPC_1 knows no past inputs
-        table = gathered(table, learned.layout.places(own.layout))
+    if own.layout.carried != learned.layout.carried:  # MPC_1 knows no past inputs, one of the user's perhaps others
+        table = with_memory(logged, own.layout)
     rest = settled(own, table)
     moduli = closed_loop_eigenvalues(own, policy.solver, table, rest)
     return replace(found, eigenvalues=moduli, leaves=moduli[:1] > (1.0,) and leaves_reference(policy, table, rest))

@@ -137,7 +137,7 @@ class OfflineMPCLearner:
             raise InvalidArgumentError("learn", expected=" or ".join(map(repr, _GROUPS)), actual=repr(learn))
         check_integers(0, seed=seed)
         if value_function is not None and value_function.ny != mpc.nx:
-            size, hint = f"a function of {mpc.nx} coordinates", "After dead time was found, give mpc.with_delay(it)."
+            size, hint = f"a function of {mpc.nx} coordinates", "Was it learned with dead time? mpc.with_delay(delay)."
             raise InvalidArgumentError("value_function", expected=size, actual=str(value_function.ny), hint=hint)
         self.preset: str | None = preset if method is None else None
         self.method: Method = method_of(preset, method, options if value is None else options | {"value": value})

@@ -169,7 +169,15 @@ class Layout:
         return inputs, np.array(ages, dtype=np.intp)
 
     def places(self, other: Layout) -> NDArray[np.intp]:
-        """Where in z what another layout's z holds stands, ``(other.nx,)``: one of as much memory, or less."""
+        """Where in z what another layout's z holds stands, ``(other.nx,)``.
+
+        Raises:
+            InvalidArgumentError: For one of other observations or inputs, or of more past values of an input.
+        """
+        fits = (other.ny, other.nu) == (self.ny, self.nu) and np.all(np.less_equal(other.carried, self.carried))
+        if not fits:
+            expected, actual = (f"{each.ny} observations, past inputs {each.carried}" for each in (self, other))
+            raise InvalidArgumentError("layout", expected=f"{expected} at most", actual=actual)
         memory = [self._place(int(i), int(age)) for i, age in zip(*other.ages, strict=True)]
         return np.array([*range(self.ny), *memory], dtype=np.intp)
 

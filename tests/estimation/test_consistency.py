@@ -25,6 +25,7 @@ from mpcoffline import (
     nominal_mpc,
 )
 from mpcoffline.estimation.findings import CHECKS, Finding
+from mpcoffline.estimation.rows import Rows, without_jumps
 
 Array = NDArray[np.float64]
 DT, STEPS, EPISODES = 0.05, 60, 20
@@ -218,6 +219,18 @@ def test_a_certain_contradiction_is_an_error(name: str, with_ids: bool) -> None:
 def test_a_dead_time_longer_than_the_episodes_is_an_error() -> None:
     report = mpcoffline.check(arm_mpc(delay=STEPS + 3), LOG.table())
     assert report.errors[0].expected.startswith(f"more than {STEPS + 3} consecutive rows")
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.6, 0.8])
+def test_a_wrapped_angle_may_turn_fast(speed: float) -> None:
+    """So many turns a step, at most: the share of the steps that cross the end of the turn."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-np.pi, np.pi, (400, 1))
+    moved = x + 2.0 * np.pi * speed * rng.uniform(0.8, 1.0, (400, 1))
+    rows = Rows(x, np.zeros((400, 1)), (moved + np.pi) % (2.0 * np.pi) - np.pi)
+    found, angles = without_jumps(rows, moved - rows.reached)
+    assert angles == (0,)
+    np.testing.assert_allclose(found.reached, moved)
 
 
 @pytest.mark.parametrize("delay", [1, 3, 7])

@@ -146,6 +146,18 @@ def test_mpc_1_handed_out_knows_no_past_inputs(tmp_path: Path) -> None:
     np.testing.assert_allclose(report.theorem.eigenvalues, np.abs(0.8 + 0.7 * slope), atol=1e-3)  # its own model
 
 
+@pytest.mark.parametrize("delay", [1, 5])
+def test_one_with_another_dead_time_handed_out_is_diagnosed(delay: int, tmp_path: Path) -> None:
+    log = belt_log(3, n_episodes=8)
+    learner = quick(belt_mpc())
+    learner.candidate = "mine"
+    learner.fit(log, show_progress=False, also={"mine": belt_mpc().with_delay(delay)})
+    assert learner.mpc.nx == 1 + delay
+    learner.save(tmp_path / "learner.zip")
+    report = diagnose(OfflineMPCLearner.load(tmp_path / "learner.zip"), log, n_starts=4, n_steps=20)
+    assert len(report.theorem.eigenvalues) == 1 + delay
+
+
 def test_a_delay_that_the_log_denies_is_kept_and_told(caplog: pytest.LogCaptureFixture) -> None:
     learner = quick(belt_mpc(1))
     learner.fit(belt_log(3), show_progress=False)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import polars
 
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)(::|://)", re.IGNORECASE)
-_OF_POLARS = ("s3", "s3a", "gs", "gcs", "az", "azure", "abfs", "abfss", "adl", "http", "https", "hf", "file")
+_OF_POLARS = ("s3", "s3a", "gs", "gcs", "az", "azure", "abfs", "abfss", "adl", "http", "https", "hf")
 
 
 def read_parquet(
@@ -88,7 +88,8 @@ def parquet_sources(paths: str | PathLike[str], **columns: Any) -> list[Callable
     with _asking(str(paths)):
         import fsspec
 
-        names = [file.full_name for file in fsspec.open_files(str(paths), "rb")]
+        files, address = fsspec.open_files(str(paths), "rb"), _ADDRESS.match(str(paths))
+        names = [file.path if address is None else file.full_name for file in files]
     if not names:
         raise StorageError(f"files {paths}", expected="one at least", actual="none")
     _, chained, within = str(paths).partition("::")  # as of files in an archive

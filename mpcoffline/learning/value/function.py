@@ -111,14 +111,17 @@ class ValueFunction(nn.Module):
         return np.asarray(values.cpu().numpy(), dtype=np.float64)
 
     def of_layout(self, own: Layout, other: Layout) -> ValueFunction:
-        """The same function of a state that holds more past inputs, of which it asks none.
+        """The same function of a state that holds more past inputs, of which it asks none: V(z[places]).
 
         Args:
-            own: What its state is made of.
-            other: With as much memory, or more.
+            own: What its state ``(own.nx,)`` is made of.
+            other: What z ``(other.nx,)`` is made of, with as much memory, or more.
 
         Returns:
-            Itself, where it is a function of that state.
+            Itself, where it is a function of as many coordinates.
+
+        Raises:
+            InvalidArgumentError: For one with less memory, or of another plant.
         """
         if self.ny == other.nx:
             return self

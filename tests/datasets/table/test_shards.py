@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -207,14 +207,27 @@ def test_parquet_files_of_any_file_system_are_packed_by_whoever_has_them(tmp_pat
     (source,) = parquet_sources(f"zip://*.parquet::file://{tmp_path}/days.zip", **how)
     np.testing.assert_allclose(source().observations[:, 0], [0.0, 0.5])
 
-    def asked(number: int) -> Callable[[], TransitionTable]:
-        return lambda: read.append(number) or sources[number]()  # type: ignore[func-returns-value]
-
     read: list[int] = []
+
+    def asked(number: int) -> TransitionTable:
+        read.append(number)
+        return sources[number]()
+
     for rank in range(2):
-        write_shards(tmp_path / "shards", [asked(number) for number in range(3)], ranks=Absent(rank, 2))
+        write_shards(tmp_path / "shards", [partial(asked, number) for number in range(3)], ranks=Absent(rank, 2))
     assert read == [0, 2, 1]  # each by one process, in turns
     assert len(ShardedTable.open(tmp_path / "shards", lanes=1)) == 6
+
+
+@pytest.mark.parametrize("scheme", ["", "file://"])
+def test_files_may_be_called_anything(scheme: str, tmp_path: Path) -> None:
+    polars, folder = pytest.importorskip("polars"), tmp_path / "a b é %20 #x"
+    pytest.importorskip("fsspec")
+    folder.mkdir()
+    for name in ("f 1%20#", "?"):
+        polars.DataFrame({"x": [0.0, 1.0], "u": [0.0] * 2, "c": [1.0] * 2}).write_parquet(folder / f"{name}.parquet")
+    sources = parquet_sources(f"{scheme}{folder}/*.parquet", observations=["x"], actions=["u"], cost="c")
+    assert [len(source()) for source in sources] == [1, 1]
 
 
 @pytest.mark.parametrize(

@@ -278,3 +278,5 @@ def test_of_a_longer_memory_it_asks_what_it_knew(hidden: tuple[int, ...], n_memb
     assert wide.ny == long.nx
     assert wide.discount == value.discount
     assert value.of_layout(short, short) is value
+    with pytest.raises(InvalidArgumentError, match="layout"):  # of more past values of one input, if of as many in all
+        ValueFunction(5).of_layout(Layout.of(2, 2, [3, 0]), Layout.of(2, 2, [1, 4]))
